@@ -1,0 +1,432 @@
+"""What happens around a pixel step: the budget, the interpolation step, the codes' projection, and what is recorded.
+
+Notation: `n` known views, `M` the length of a code; "training seconds" are those spent in training steps alone.
+
+The order matters, and `train.py` keeps it: `Budget` (rate before a step, stop after), `InterpolationLoss`,
+`RenormalizeCodes` (so that the codes are on the sphere whenever a pixel step reads them), then what only looks:
+`ErrorClock`, `ViewLogger`, `Progress`, and `SaveCheckpoint` last.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+from torch.utils.tensorboard import SummaryWriter
+
+from viinter.codes import lerp
+from viinter.config import EvaluationConfig, InterpolationConfig, LoggingConfig, OptimConfig, plain
+from viinter.features import FeatureTower, interpolation_loss
+from viinter.module import ViewInterpolator
+from viinter.scenes import Scene
+from viinter.views import draw, measure, pixel_grid
+
+CSV_COLUMNS = [
+    "step", "training_seconds", "wall_seconds", "known_mse", "known_psnr", "known_ssim", "novel_mse", "novel_psnr",
+    "novel_ssim", "code_norm_min", "code_norm_max", "lr",
+]  # fmt: skip
+
+
+class Clock:
+    """Training seconds: runs between `start` and `stop`, stands still inside `paused()`.
+
+    Reading it costs no synchronisation; a pause waits for the device first, so that queued training work is counted
+    as training and not as whatever comes next.
+    """
+
+    def __init__(self) -> None:
+        self.before, self.since, self.born = 0.0, None, time.perf_counter()
+        self.wall_before = 0.0
+
+    @property
+    def seconds(self) -> float:
+        return self.before + (time.perf_counter() - self.since if self.since is not None else 0.0)
+
+    @property
+    def wall_seconds(self) -> float:
+        return self.wall_before + time.perf_counter() - self.born
+
+    def start(self) -> None:
+        self.since = time.perf_counter()
+
+    def stop(self) -> None:
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
+        self.before, self.since = self.seconds, None
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        running = self.since is not None
+        if running:
+            self.stop()
+        try:
+            yield
+        finally:
+            if running:
+                self.start()
+
+    def state_dict(self) -> dict[str, float]:
+        return {"training_seconds": self.seconds, "wall_seconds": self.wall_seconds}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self.before = state["training_seconds"]
+        self.wall_before, self.born = state["wall_seconds"], time.perf_counter()
+
+
+class Budget(L.Callback):
+    """Ends the run after so many steps or training seconds, and lays the cosine schedule over whichever is given.
+
+    The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end.
+    """
+
+    def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
+        self.cfg, self.clock = cfg, clock
+
+    def progress(self, trainer: L.Trainer) -> float:
+        """The share of the budget that is used, in [0, 1]."""
+        if self.cfg.training_seconds is not None:
+            return min(self.clock.seconds / self.cfg.training_seconds, 1.0)
+        return min(trainer.global_step / self.cfg.steps, 1.0)
+
+    def factor(self, progress: float) -> float:
+        """The rate at `progress`, as a share of the first."""
+        return self.cfg.lr_decay + (1 - self.cfg.lr_decay) * (1 + math.cos(math.pi * progress)) / 2
+
+    def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.clock.start()
+        trainer.should_stop = self.progress(trainer) >= 1
+
+    def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
+        factor = self.factor(self.progress(trainer))
+        for group in trainer.optimizers[0].param_groups:
+            group["lr"] = group["initial_lr"] * factor
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        if self.progress(trainer) >= 1:
+            trainer.should_stop = True
+
+    def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.clock.stop()
+
+    def state_dict(self) -> dict[str, float]:
+        return self.clock.state_dict()
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self.clock.load_state_dict(state)
+
+
+class InterpolationLoss(L.Callback):
+    """The interpolation step (paper Section 3.4): every `every`-th step, a whole frame from a mix of two codes.
+
+    Random known views i and j and t in [0, 1]; the frame drawn from `(1 - t) z_i + t z_j` is held against the same
+    mix of the two views' features. It is an optimiser step of its own, as in the published code (the paper adds the
+    two losses), and does not count in `global_step`. The frame is drawn in chunks whose activations are worked out
+    again in the backward pass, so that memory follows `chunk_pixels`.
+
+    Args:
+        cfg: weight, interval, chunk.
+        tower: the frozen feature extractor.
+        features: of the known views, [n, D], extracted once.
+        size: (height, width) of the frame that the tower sees.
+        seed: draws i, j and t of a step from `seed` and the step alone.
+    """
+
+    def __init__(
+        self, cfg: InterpolationConfig, tower: FeatureTower, features: Tensor, size: tuple[int, int], seed: int
+    ) -> None:
+        self.cfg, self.tower, self.features, self.size, self.seed = cfg, tower, features, size, seed
+        self.last: Tensor | None = None
+        self.random = torch.Generator()
+
+    def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.features = self.features.to(module.device)
+        self.tower.to(module.device)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
+        step = trainer.global_step - 1
+        if step % self.cfg.every:
+            return
+        self.random.manual_seed((self.seed * 0x9E3779B1 + step) % 2**32)
+        i, j = torch.randint(len(self.features), (2,), generator=self.random).tolist()
+        t = torch.rand((), generator=self.random).item()
+        optimizer = module.optimizers()
+
+        def closure() -> Tensor:
+            optimizer.zero_grad()
+            with trainer.strategy.precision_plugin.train_step_context():
+                z = lerp(module.codes.weight[i], module.codes.weight[j], t)
+                frame = self.frame(module.field, z)
+            seen = self.tower(frame)[0]
+            loss = self.cfg.alpha * interpolation_loss(seen, self.features[i], self.features[j], t)
+            trainer.strategy.backward(loss, None)
+            self.last = loss.detach()
+            return loss
+
+        optimizer.step(closure)
+
+    def frame(self, field: torch.nn.Module, z: Tensor) -> Tensor:
+        """The frame [1, 3, h, w] float32 under the code `z` [M], with gradients to field and code."""
+        h, w = self.size
+        chunks = pixel_grid(h, w, z.device).split(self.cfg.chunk_pixels)
+        draw_chunk: Callable[[Tensor], Tensor] = lambda xy: field(xy[None], z[None])[0]  # noqa: E731
+        if len(chunks) == 1:
+            rgb = draw_chunk(chunks[0])
+        else:
+            rgb = torch.cat([checkpoint(draw_chunk, xy, use_reentrant=False) for xy in chunks])
+        return rgb.float().reshape(1, h, w, 3).permute(0, 3, 1, 2)
+
+
+class RenormalizeCodes(L.Callback):
+    """Puts the codes on the p-norm sphere after every optimiser step (paper Section 3.3, Equation 5), and at the start.
+
+    At the start of a resumed run codes that are on the sphere are left as they are, to the last bit.
+    """
+
+    def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        off = (module.codes.norms() / module.codes.radius - 1).abs().max()
+        if off > 1e-6:
+            module.codes.project_()
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
+        module.codes.project_()
+
+
+class ErrorClock(L.Callback):
+    """Error against run time: measures known views and standard probes at geometrically spaced training seconds.
+
+    The first measurement comes at `first_seconds`, each next when the training seconds have grown by `factor`, and
+    none if all of them together would take more than `max_share` of the training seconds; one at the end always.
+    The clock stands still meanwhile. Each gives a row of `error_vs_time.csv` and scalars in TensorBoard.
+    """
+
+    def __init__(self, cfg: EvaluationConfig, scene: Scene, clock: Clock, run_dir: Path) -> None:
+        self.cfg, self.scene, self.clock, self.file = cfg, scene, clock, run_dir / "error_vs_time.csv"
+        self.rows: list[dict[str, Any]] = []
+        self.next, self.spent, self.longest = cfg.first_seconds, 0.0, 0.0
+        self.final: dict[str, dict] = {}
+        self.listeners: list[Callable[[str, int, Tensor, Tensor], None]] = []
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
+        now = self.clock.seconds
+        if now < self.next or trainer.should_stop:
+            return
+        if self.spent + self.longest > self.cfg.max_share * now:
+            self.next = (self.spent + self.longest) / self.cfg.max_share if self.cfg.max_share else math.inf
+            return
+        self.evaluate(trainer, module, ["known", "novel"])
+        self.next = now * self.cfg.factor
+
+    def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        if self.rows and self.rows[-1]["step"] == trainer.global_step:
+            self.rows.pop()
+        self.final = self.evaluate(trainer, module, ["known", *self.scene.probes])
+
+    def evaluate(self, trainer: L.Trainer, module: ViewInterpolator, kinds: list[str]) -> dict[str, dict]:
+        """Measures and adds a row, with the clock standing still."""
+        with self.clock.paused():
+            begin = time.perf_counter()
+            training, wall = self.clock.seconds, self.clock.wall_seconds
+            module.eval()
+            with trainer.strategy.precision_plugin.forward_context():
+                found = measure(
+                    module.field, module.codes.weight.detach(), self.scene, kinds, self.cfg.chunk_pixels, self._seen
+                )
+            module.train()
+            norms = module.codes.norms()
+            row = {"step": trainer.global_step, "training_seconds": training, "wall_seconds": wall}
+            for kind in ("known", "novel"):
+                row |= {f"{kind}_{key}": found[kind][key] for key in ("mse", "psnr", "ssim")}
+            row |= {"code_norm_min": norms.min().item(), "code_norm_max": norms.max().item()}
+            row["lr"] = trainer.optimizers[0].param_groups[0]["lr"]
+            self.rows.append(row)
+            self._write(trainer.logger.experiment, row)
+            took = time.perf_counter() - begin
+            self.spent, self.longest = self.spent + took, max(self.longest, took)
+        return found
+
+    def _seen(self, kind: str, index: int, image: Tensor, target: Tensor) -> None:
+        for listener in self.listeners:
+            listener(kind, index, image, target)
+
+    def _write(self, board: SummaryWriter, row: dict[str, Any]) -> None:
+        part = self.file.with_suffix(".part")
+        with part.open("w", newline="") as out:
+            table = csv.DictWriter(out, CSV_COLUMNS)
+            table.writeheader()
+            table.writerows(self.rows)
+        os.replace(part, self.file)
+        for key, value in row.items():
+            if value is not None and key != "step":
+                group, _, what = key.partition("_")
+                tag = f"{group}/{what}" if group in ("known", "novel") else f"run/{key}"
+                board.add_scalar(tag, value, row["step"])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"rows": self.rows, "next": self.next, "spent": self.spent, "longest": self.longest}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.rows, self.next = state["rows"], state["next"]
+        self.spent, self.longest = state["spent"], state["longest"]
+
+
+class ViewLogger(L.Callback):
+    """Pictures in TensorBoard: a known view and a probe beside their targets, and a strip of an interpolation.
+
+    It takes the pictures that `ErrorClock` draws anyway; the scalars of single steps (loss, PSNR of the batch, L_inter,
+    rate, norms) go out every `every_seconds`, so that no step waits for them.
+    """
+
+    def __init__(self, cfg: LoggingConfig, scene: Scene, clock: Clock, errors: ErrorClock, chunk_pixels: int) -> None:
+        self.cfg, self.scene, self.clock, self.chunk_pixels = cfg, scene, clock, chunk_pixels
+        self.next = 0.0
+        self.kept: dict[str, Tensor] = {}
+        self.measured = 0
+        self.errors = errors
+        self.interpolation: InterpolationLoss | None = None
+        if cfg.pictures:
+            errors.listeners.append(self._keep)
+
+    def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.interpolation = next((c for c in trainer.callbacks if isinstance(c, InterpolationLoss)), None)
+        self.measured = len(self.errors.rows)
+
+    def _keep(self, kind: str, index: int, image: Tensor, target: Tensor) -> None:
+        if index == 0:
+            self.kept[kind] = torch.cat([image.clamp(0, 1), target], 1)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, outputs: Any, *_: Any) -> None:
+        if self.clock.seconds >= self.next:
+            with self.clock.paused():
+                self._scalars(trainer, module, outputs["loss"].item())
+            self.next = self.clock.seconds + self.cfg.every_seconds
+        if len(self.errors.rows) > self.measured:
+            self.measured = len(self.errors.rows)
+            with self.clock.paused():
+                self._pictures(trainer, module)
+
+    def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self._pictures(trainer, module)
+        final = {
+            f"final/{kind}_{key}": self.errors.final[kind][key]
+            for kind in ("known", "novel") for key in ("psnr", "ssim") if self.errors.final[kind][key] is not None
+        }  # fmt: skip
+        trainer.logger.log_hyperparams(_flat(plain(module.cfg)), final)
+
+    def _scalars(self, trainer: L.Trainer, module: ViewInterpolator, loss: float) -> None:
+        board, step = trainer.logger.experiment, trainer.global_step
+        board.add_scalar("train/loss", loss, step)
+        if loss > 0:
+            board.add_scalar("train/psnr", -10 * math.log10(loss), step)
+        if self.interpolation and self.interpolation.last is not None:
+            board.add_scalar("train/interpolation_loss", self.interpolation.last.item(), step)
+        board.add_scalar("run/lr", trainer.optimizers[0].param_groups[0]["lr"], step)
+        norms = module.codes.norms()
+        board.add_scalar("run/code_norm_min", norms.min().item(), step)
+        board.add_scalar("run/code_norm_max", norms.max().item(), step)
+
+    def _pictures(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        if not self.cfg.pictures:
+            return
+        board, step = trainer.logger.experiment, trainer.global_step
+        for kind, pair in self.kept.items():
+            board.add_image(f"views/{kind}_and_target", pair, step, dataformats="HWC")
+        i, j = self.scene.endpoints
+        module.eval()
+        with trainer.strategy.precision_plugin.forward_context():
+            z = module.codes.weight.detach()
+            frames = [
+                draw(module.field, lerp(z[i], z[j], t / 4), self.scene.height, self.scene.width, self.chunk_pixels)
+                for t in range(5)
+            ]
+        module.train()
+        board.add_image("views/interpolation", torch.cat(frames, 1).clamp(0, 1), step, dataformats="HWC")
+        board.flush()
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level, `optim.lr`, for TensorBoard's HPARAMS tab."""
+    found = {}
+    for key, value in values.items():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in found.items()}
+
+
+class ProgressBar(L.Callback):
+    """A bar with loss, PSNR of the batch, the last PSNR of known views and probes, and the time left.
+
+    It is refreshed twice a second and reads the loss only then: a step waits for nothing.
+    """
+
+    def __init__(self, budget: Budget, clock: Clock, errors: ErrorClock) -> None:
+        self.budget, self.clock, self.errors, self.next = budget, clock, errors, 0.0
+        self.bar = Progress(
+            TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.percentage:5.1f} %"),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[numbers]}"),
+        )  # fmt: skip
+
+    def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.bar.start()
+        self.task = self.bar.add_task("training", total=1.0, numbers="")
+        self.errors.listeners.append(self._evaluating)
+
+    def _evaluating(self, kind: str, index: int, *_: Any) -> None:
+        self.bar.update(self.task, description=f"measuring {kind} {index + 1}")
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, outputs: Any, *_: Any) -> None:
+        now = time.perf_counter()
+        if now < self.next:
+            return
+        self.next = now + 0.5
+        loss = outputs["loss"].item()
+        numbers = f"step {trainer.global_step}  loss {loss:.2e}"
+        if loss > 0:
+            numbers += f"  batch {-10 * math.log10(loss):.1f} dB"
+        if self.errors.rows:
+            row = self.errors.rows[-1]
+            numbers += "".join(f"  {k} {row[f'{k}_psnr']:.1f} dB" for k in ("known", "novel") if row[f"{k}_psnr"])
+        self.bar.update(self.task, completed=self.budget.progress(trainer), numbers=numbers, description="training")
+
+    def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.bar.update(self.task, completed=1.0, description="training")
+        self.bar.stop()
+
+    def on_exception(self, trainer: L.Trainer, module: ViewInterpolator, exception: BaseException) -> None:
+        self.bar.stop()
+
+
+class SaveCheckpoint(L.Callback):
+    """`checkpoints/last.ckpt`, every so many wall seconds and at the end: written beside, then put in place."""
+
+    def __init__(self, every_seconds: float, clock: Clock, run_dir: Path) -> None:
+        self.every_seconds, self.clock, self.file = every_seconds, clock, run_dir / "checkpoints" / "last.ckpt"
+        self.next = time.perf_counter() + every_seconds
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        if time.perf_counter() >= self.next and not trainer.should_stop:
+            self.save(trainer)
+
+    def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.save(trainer)
+
+    def on_exception(self, trainer: L.Trainer, module: ViewInterpolator, exception: BaseException) -> None:
+        if isinstance(exception, KeyboardInterrupt) and trainer.global_step:
+            self.save(trainer)
+
+    def save(self, trainer: L.Trainer) -> None:
+        with self.clock.paused():
+            part = self.file.with_suffix(".part")
+            trainer.save_checkpoint(part)
+            if trainer.is_global_zero:
+                os.replace(part, self.file)
+            self.next = time.perf_counter() + self.every_seconds

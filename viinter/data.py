@@ -1,0 +1,97 @@
+"""The pixels of a scene, kept on the training device and sampled there.
+
+Notation: `n` known views of `H x W`; a batch holds `V` views and `P` pixels of each. Pixel j of W sits at
+x = -1 + 2j/W.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from viinter.config import PixelsFrom
+from viinter.scenes import Scene
+
+
+class PixelBatch(NamedTuple):
+    """`view` [V] indices of known views, `xy` [V, P, 2] in [-1, 1), `rgb` [V, P, 3] in [0, 1]."""
+
+    view: Tensor
+    xy: Tensor
+    rgb: Tensor
+
+
+class PixelStore:
+    """All known pixels on one device, and batches drawn from them at random, with replacement.
+
+    Batch k depends on `seed` and k alone, so that a resumed run goes on with the very batches it would have had.
+    `one_view`: `pixels` of one random view (the published code). `all_views`: the same number spread evenly over
+    all views (over `pixels` of them, drawn at random, if there are more views than pixels).
+    """
+
+    def __init__(self, views: Tensor, pixels: int, pixels_from: PixelsFrom, seed: int, device: torch.device) -> None:
+        self.n, self.height, self.width, _ = views.shape
+        self.rgb = views.reshape(-1, 3).to(device)
+        self.pixels, self.pixels_from, self.seed = pixels, pixels_from, seed
+        self.generator = torch.Generator(device)
+        self.pitch = torch.tensor([2 / self.width, 2 / self.height], device=device)
+        self.every_view = torch.arange(self.n, device=device)
+
+    def batch(self, k: int) -> PixelBatch:
+        """Batch number `k`."""
+        random, device = self.generator.manual_seed((self.seed * 0x9E3779B1 + k) % 2**32), self.rgb.device
+        if self.pixels_from is PixelsFrom.one_view:
+            view, share = torch.randint(self.n, (1,), generator=random, device=device), self.pixels
+        elif self.n <= self.pixels:
+            view, share = self.every_view, -(-self.pixels // self.n)
+        else:
+            view, share = torch.randint(self.n, (self.pixels,), generator=random, device=device), 1
+        pixel = torch.randint(self.height * self.width, (len(view), share), generator=random, device=device)
+        row = torch.div(pixel, self.width, rounding_mode="floor")
+        xy = torch.stack([pixel - row * self.width, row], -1) * self.pitch - 1
+        return PixelBatch(view, xy, self.rgb[pixel + view[:, None] * (self.height * self.width)])
+
+
+class _Batches:
+    """An endless iterable of batches, starting where the trainer stands. It has no state of its own: its
+    `state_dict` is there to tell Lightning that it can be resumed."""
+
+    def __init__(self, store: PixelStore, trainer: L.Trainer) -> None:
+        self.store, self.trainer = store, trainer
+
+    def __iter__(self) -> Iterator[PixelBatch]:
+        k = self.trainer.global_step
+        while True:
+            yield self.store.batch(k)
+            k += 1
+
+    def state_dict(self) -> dict:
+        return {}
+
+    def load_state_dict(self, state: dict) -> None:
+        pass
+
+
+class SceneData(L.LightningDataModule):
+    """Serves the known views of a scene (any layout) as an endless stream of `PixelBatch`es on the training device.
+
+    There are no workers and no copies: a scene's pixels fit any device that can train on them, and a worker that ships
+    them costs more than a training step.
+    """
+
+    def __init__(self, scene: Scene, batch_pixels: int, pixels_from: PixelsFrom, seed: int) -> None:
+        super().__init__()
+        self.scene, self.batch_pixels, self.pixels_from, self.seed = scene, batch_pixels, pixels_from, seed
+
+    def train_dataloader(self) -> _Batches:
+        device = self.trainer.strategy.root_device
+        # every process of a distributed run draws pixels of its own
+        seed = self.seed + 1_000_003 * self.trainer.global_rank
+        return _Batches(PixelStore(self.scene.views, self.batch_pixels, self.pixels_from, seed, device), self.trainer)
+
+    def transfer_batch_to_device(self, batch: PixelBatch, device: torch.device, dataloader_idx: int) -> PixelBatch:
+        return batch  # it was made there

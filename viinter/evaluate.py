@@ -1,0 +1,97 @@
+"""`python -m viinter.evaluate run=DIR`: a finished run measured again, and once more with finetuned codes.
+
+Notation: a probe's code is first the mix of its endpoints' codes; finetuned, it is optimised alone against the probe's
+own image while the field stays as it is (paper Table 3): how much of the error is the code's, how much the field's.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor, nn
+
+from viinter import command, config, metrics, scenes
+from viinter.codes import mix
+from viinter.config import ConfigError, EvaluateConfig
+from viinter.data import PixelStore
+from viinter.module import load, run_device
+from viinter.scenes import Probe
+from viinter.train import describe, write_json
+from viinter.views import draw, measure
+
+ABOUT = """
+Measures the known views and probes of a finished run: PSNR, SSIM, MSE, for every image and on average; then the probes
+with codes finetuned against their own images, the field frozen. Writes RUN/evaluation.json.
+
+  python -m viinter.evaluate run=outputs/demo/paper/DATE_TIME
+  python -m viinter.evaluate run=... finetune_steps=0                without finetuned codes
+"""
+
+
+def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
+    """Measures the run folder `cfg.run` and writes `evaluation.json` there.
+
+    Returns:
+        `known`, `novel`, ... as in `metrics.json`, and `finetuned` for the standard probes.
+
+    Raises:
+        UserError: no run folder, or the scene's images are not those it was trained on.
+    """
+    console = Console()
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    trained = config.read_run(cfg.run, [f"paths.data={cfg.data}"] if cfg.data else [])
+    model = load(cfg.run, run_device(cfg.accelerator))
+    scene = scenes.load(trained.scene)
+    if scene.names != model.about["names"]:
+        raise ConfigError(f"{trained.scene.root} no longer holds the known views that {cfg.run} was trained on")
+    console.print(describe(scene))
+    codes = model.codes.weight.detach()
+    with console.status("measuring every view") as status:
+        found: dict[str, Any] = measure(
+            model.field, codes, scene, None, cfg.chunk_pixels,
+            lambda kind, k, *_: status.update(f"measuring {kind} {k + 1}"),
+        )  # fmt: skip
+    if cfg.finetune_steps and scene.probes["novel"]:
+        errors = {}
+        for probe in track(scene.probes["novel"], "finetuning codes", console=console):
+            z = finetune(model.field, codes, probe, cfg)
+            image = draw(model.field, z, scene.height, scene.width, cfg.chunk_pixels)
+            errors[probe.name] = metrics.compare(image, probe.target.to(image.device))
+        found["finetuned"] = metrics.summary(errors)
+    write_json(Path(cfg.run) / "evaluation.json", found)
+    for kind, values in found.items():
+        shown = [f"{values[k]:.{d}f} {unit}" for k, d, unit in (("psnr", 2, "dB"), ("ssim", 4, "SSIM"))
+                 if values[k] is not None]  # fmt: skip
+        console.print(f"{kind:16} {len(values['per_view']):4} views  {'  '.join(shown)}", highlight=False)
+    console.print(f"written: {Path(cfg.run) / 'evaluation.json'}", highlight=False)
+    return found
+
+
+def finetune(field: nn.Module, codes: Tensor, probe: Probe, cfg: EvaluateConfig) -> Tensor:
+    """The code [M] that shows `probe.target` best, found by Adam from the probe's mix; `field` is not touched.
+
+    The code is not held on the sphere: a mix lies inside it. Its step is measured against the code book's own scale,
+    which the norm's order changes by orders of magnitude, and falls to zero along a cosine.
+    """
+    z = mix(codes, probe.mix).requires_grad_()
+    store = PixelStore(probe.target[None], cfg.finetune_pixels, config.PixelsFrom.one_view, 0, codes.device)
+    first = cfg.finetune_lr * codes.square().mean().sqrt().item()
+    optimizer = torch.optim.Adam([z], lr=first)
+    for step in range(cfg.finetune_steps):
+        optimizer.param_groups[0]["lr"] = first * (1 + math.cos(math.pi * step / cfg.finetune_steps)) / 2
+        batch = store.batch(step)
+        loss = F.mse_loss(field(batch.xy, z[None]), batch.rgb)
+        (z.grad,) = torch.autograd.grad(loss, [z])
+        optimizer.step()
+    return z.detach()
+
+
+if __name__ == "__main__":
+    command.main(EvaluateConfig, "evaluate", lambda cfg, _: evaluate(cfg), ABOUT)

@@ -1,0 +1,1 @@
+"""The fields `F(xy | z) -> rgb`: one file for each."""

@@ -1,0 +1,91 @@
+"""The field and the code book of a scene as one LightningModule: the pixel step, the optimiser, the checkpoint.
+
+Notation: `n` known views, `M` the length of a code; rgb in [0, 1].
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from viinter.codes import CodeBook
+from viinter.config import ConfigError, TrainConfig, from_plain, norm_order, plain
+from viinter.data import PixelBatch
+from viinter.fields.paper import PaperField
+
+
+def make_field(cfg: Any) -> torch.nn.Module:
+    """The field that a model configuration (`config.MODELS`) describes."""
+    fields = {"paper": PaperField}
+    settings = {k: v for k, v in plain(cfg).items() if k != "name"}
+    return fields[cfg.name](**settings)
+
+
+class ViewInterpolator(L.LightningModule):
+    """F(xy | z) and one code for each of the `n` known views, trained on pixels (`L_recon`, paper Section 3.2).
+
+    The loss is the mean squared error over pixels and channels, as in the published code; the paper writes the sum,
+    which is the same up to the learning rate (and Adam does not see it).
+
+    Args:
+        cfg: the whole configuration; it travels in the checkpoint as plain values.
+        n: number of known views.
+        about: plain facts on the scene that drawing needs without the images: names, height, width, endpoints, white.
+    """
+
+    def __init__(self, cfg: TrainConfig, n: int, about: dict[str, Any]) -> None:
+        super().__init__()
+        self.cfg, self.about = cfg, about
+        self.field = make_field(cfg.model)
+        self.codes = CodeBook(n, cfg.model.code_dim, norm_order(cfg.codes.p), cfg.codes.radius)
+        self.codes.project_()
+
+    def forward(self, xy: Tensor, z: Tensor) -> Tensor:
+        """Colours [V, P, 3] of `xy` [V, P, 2] under codes `z` [V, M]."""
+        return self.field(xy, z)
+
+    def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
+        return F.mse_loss(self.field(batch.xy, self.codes.weight[batch.view]), batch.rgb)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Adam over field and codes (supplement); the rate is set before each step by `callbacks.Budget`."""
+        lr = self.cfg.optim.lr
+        parameters = [*self.field.parameters(), self.codes.weight]
+        return torch.optim.Adam([{"params": parameters, "initial_lr": lr}], lr=lr, fused=True)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["config"], checkpoint["about"] = plain(self.cfg), self.about
+
+
+def load(run: str | Path, device: torch.device | str = "cpu") -> ViewInterpolator:
+    """The trained model of the run folder `run`, in evaluation mode on `device`.
+
+    Only plain values and tensors are read from the checkpoint (`weights_only=True`). Raises ConfigError if there is no
+    checkpoint or it is not one of ours.
+    """
+    file = Path(run) / "checkpoints" / "last.ckpt"
+    if not file.is_file():
+        raise ConfigError(f"{run} is no run folder with a checkpoint: there is no {file}")
+    try:
+        checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+        cfg = from_plain(checkpoint["config"])
+        model = ViewInterpolator(cfg, len(checkpoint["about"]["names"]), checkpoint["about"])
+        model.load_state_dict(checkpoint["state_dict"])
+    except (KeyError, RuntimeError, EOFError, OSError, ValueError, TypeError, ImportError) as error:
+        raise ConfigError(f"{file} is not a whole checkpoint of this version: {error}") from error
+    return model.to(device).eval()
+
+
+def run_device(accelerator: str) -> torch.device:
+    """The device of `auto`, `cpu`, `cuda`, `mps`; raises ConfigError for one that is not here."""
+    if accelerator == "auto":
+        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not here.get(accelerator):
+        raise ConfigError(f"accelerator={accelerator}: expected auto or one of {[k for k, ok in here.items() if ok]}")
+    return torch.device(accelerator)

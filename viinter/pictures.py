@@ -1,0 +1,59 @@
+"""Pictures of a run that a person looks at first: the strip, the film, error against run time.
+
+Notation: frames are [H, W, 3] in [0, 1].
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import torch
+from torch import Tensor, nn
+
+from viinter import image, video
+from viinter.codes import path
+from viinter.views import draw
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+STRIP = 5
+
+
+def write_strip(file: Path, field: nn.Module, codes: Tensor, ends: tuple[int, int], size: tuple[int, int],
+                chunk_pixels: int) -> None:  # fmt: skip
+    """Five frames side by side at t = 0, 1/4, 1/2, 3/4, 1 between two known views (as the paper's Figure 5)."""
+    frames = [draw(field, z, *size, chunk_pixels) for z in path(codes, list(ends), STRIP - 1)]
+    image.write(file, torch.cat(frames, 1).clamp(0, 1).cpu())
+
+
+def write_film(file: Path, field: nn.Module, codes: Tensor, size: tuple[int, int], chunk_pixels: int) -> None:
+    """`interpolation.mp4` of the codes [F, M], there and back again, so that it plays without a jump."""
+    there = [draw(field, z, *size, chunk_pixels).clamp(0, 1).mul(255).round().to("cpu", torch.uint8) for z in codes]
+    video.write_mp4(file, (frame / 255 for frame in there + there[-2:0:-1]), fps=30)
+
+
+def plot_error(file: Path, rows: list[dict[str, Any]], title: str) -> None:
+    """MSE against training seconds, both on log axes, known views and probes apart."""
+    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+    for kind, style in (("known", "o-"), ("novel", "s--")):
+        points = [(r["training_seconds"], r[f"{kind}_mse"]) for r in rows if r[f"{kind}_mse"]]
+        if points:
+            axes.plot(*zip(*points, strict=True), style, label=f"{kind} views", markersize=4)
+    axes.set(xscale="log", yscale="log", xlabel="training seconds", ylabel="mean squared error", title=title)
+    axes.grid(True, which="both", alpha=0.3)
+    if axes.lines:
+        axes.legend()
+        decibel = axes.secondary_yaxis("right", functions=(lambda m: -10 * _log10(m), lambda d: 10 ** (-d / 10)))
+        decibel.set_ylabel("dB of that mean")
+        decibel.set_yscale("linear")
+    figure.savefig(file, dpi=130)
+    plt.close(figure)
+
+
+def _log10(values: Any) -> Any:
+    import numpy as np
+
+    return np.log10(np.maximum(values, 1e-12))

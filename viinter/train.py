@@ -1,0 +1,217 @@
+"""`python -m viinter.train`: from the files of a scene to a run folder, top to bottom.
+
+files -> `scenes.load` -> `SceneData` -> `PixelBatch` -> code -> field -> loss -> optimiser -> `InterpolationLoss` ->
+`RenormalizeCodes` -> `ErrorClock` -> `metrics.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import platform
+import resource
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from rich.console import Console
+
+from viinter import command, config, features, pictures, scenes
+from viinter.callbacks import (
+    Budget,
+    Clock,
+    ErrorClock,
+    InterpolationLoss,
+    ProgressBar,
+    RenormalizeCodes,
+    SaveCheckpoint,
+    ViewLogger,
+)
+from viinter.codes import path
+from viinter.config import ConfigError, PaperModel, TrainConfig, UserError
+from viinter.data import SceneData
+from viinter.module import ViewInterpolator
+from viinter.scenes import Scene
+
+ABOUT = """
+Trains one field and one code for each image of a scene, and draws the views between them.
+
+  python -m viinter.train scale=cpu                                  the shipped scene, two minutes on two cores
+  python -m viinter.train scene=folder scene.root=DIR scale=cpu      your own photographs
+  python -m viinter.train scene=stanford/lego model.code_dim=64      the paper's network (a GPU and hours)
+  python -m viinter.train -m codes.p=none,inf,2,1.5,1                a sweep, one run folder for each
+  python -m viinter.train resume=RUN_DIR                             goes on with an interrupted run
+  tensorboard --logdir outputs                                       watch
+"""
+
+
+def train(cfg: TrainConfig, run_dir: Path, resume: bool = False) -> dict[str, Any]:
+    """Trains on a scene and fills the run folder.
+
+    Args:
+        cfg: all settings.
+        run_dir: where everything is written.
+        resume: go on from `run_dir/checkpoints/last.ckpt`.
+
+    Returns:
+        What `metrics.json` holds: plain numbers, lists and strings.
+
+    Raises:
+        UserError: settings, images or weights that cannot be used; nothing has been trained then.
+    """
+    config.check(cfg)
+    console = Console(quiet=not cfg.logging.progress)
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    # Lightning 2.6 asks torch 2.14's pytree in the old way
+    warnings.filterwarnings("ignore", "`isinstance.treespec, LeafSpec.`", FutureWarning)
+    L.seed_everything(cfg.seed, verbose=False)
+
+    scene = scenes.load(cfg.scene)
+    console.print(describe(scene))
+    data = SceneData(scene, cfg.optim.batch_pixels, cfg.optim.pixels_from, cfg.seed)
+    module = ViewInterpolator(cfg, scene.n, about(scene))
+
+    run_dir.mkdir(parents=True, exist_ok=True)
+    clock = Clock()
+    budget = Budget(cfg.optim, clock)
+    errors = ErrorClock(cfg.evaluation, scene, clock, run_dir)
+    callbacks: list[L.Callback] = [budget]
+    if cfg.interpolation.alpha > 0:
+        callbacks.append(interpolation_step(cfg, scene, console))
+    callbacks += [RenormalizeCodes(), errors]
+    callbacks.append(ViewLogger(cfg.logging, scene, clock, errors, cfg.evaluation.chunk_pixels))
+    if cfg.logging.progress:
+        callbacks.append(ProgressBar(budget, clock, errors))
+    checkpoint = SaveCheckpoint(cfg.checkpoint.every_seconds, clock, run_dir)
+    callbacks.append(checkpoint)
+
+    trainer = L.Trainer(
+        **config.plain(cfg.trainer),
+        max_epochs=-1,
+        logger=TensorBoardLogger(run_dir, name="", version="", default_hp_metric=False),
+        callbacks=callbacks,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+    )
+    trainer.fit(module, data, ckpt_path=checkpoint.file if resume else None, weights_only=True)
+    if trainer.interrupted:
+        raise UserError(f"interrupted at step {trainer.global_step}; go on with: viinter.train resume={run_dir}")
+
+    metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
+    write_json(run_dir / "metrics.json", metrics)
+    (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
+    if cfg.logging.pictures:
+        show(cfg, scene, module, errors, run_dir)
+    console.print(summary(metrics, run_dir))
+    return metrics
+
+
+def interpolation_step(cfg: TrainConfig, scene: Scene, console: Console) -> InterpolationLoss:
+    """Loads the feature tower and extracts the known views' features, once (supplement, Algorithm 1, "Prepare")."""
+    tower = features.load(cfg.features, torch.device("cpu"))
+    with console.status(f"features of {scene.n} views"):
+        embedded = features.embed_views(tower, scene.views)
+    size = features.frame_size(scene.height, scene.width)
+    return InterpolationLoss(cfg.interpolation, tower, embedded, size, cfg.seed)
+
+
+def about(scene: Scene) -> dict[str, Any]:
+    """What drawing needs to know of the scene without its images; travels in the checkpoint."""
+    return {"name": scene.name, "names": scene.names, "height": scene.height, "width": scene.width,
+            "endpoints": list(scene.endpoints), "white": scene.white}  # fmt: skip
+
+
+def describe(scene: Scene) -> str:
+    """The scene in a few lines."""
+    probes = ", ".join(f"{len(p)} {kind}" for kind, p in scene.probes.items() if p) or "none"
+    lines = [f"{scene.name}: {scene.n} known views of {scene.height} x {scene.width}; probes: {probes}"]
+    return "\n".join([*lines, *(f"  {note}" for note in scene.notes)])
+
+
+def omitted(cfg: TrainConfig, scene: Scene) -> list[dict[str, str]]:
+    """What this scene did not need, and why."""
+    found = []
+    if cfg.interpolation.alpha == 0:
+        found.append({"part": "interpolation step and feature tower", "reason": "interpolation.alpha is 0"})
+    if cfg.codes.p == "none":
+        found.append({"part": "code projection", "reason": "codes.p is none"})
+    if not scene.probes["novel"]:
+        found.append({"part": "held-out evaluation", "reason": "the scene has no probes"})
+    found.append({"part": "camera poses and grid positions", "reason": "training never reads them"})
+    if cfg.trainer.precision == "32-true":
+        found.append({"part": "mixed precision", "reason": "trainer.precision is 32-true"})
+    return found
+
+
+def facts(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, trainer: L.Trainer, clock: Clock) -> dict[str, Any]:
+    """What `metrics.json` says of the run beside the errors: time, memory, what was left out, versions."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
+    found = {
+        "training_seconds": clock.seconds, "wall_seconds": clock.wall_seconds, "steps": trainer.global_step,
+        "peak_memory_mb": peak, "codes_redrawn": int(module.codes.redrawn), "probes_left_out": scene.left_out,
+        "omitted": omitted(cfg, scene), "scene": scene.name, "model": cfg.model.name, "seed": cfg.seed,
+        "threads": torch.get_num_threads(), "device": str(module.device), "precision": cfg.trainer.precision,
+        "versions": {"python": platform.python_version(), "torch": torch.__version__, "lightning": L.__version__},
+    }  # fmt: skip
+    if module.device.type == "cuda":
+        found["peak_device_memory_mb"] = torch.cuda.max_memory_allocated() / 2**20
+    return found
+
+
+def show(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, errors: ErrorClock, run_dir: Path) -> None:
+    """`strip.png`, `interpolation.mp4`, `error_vs_time.png`."""
+    size, chunk, codes = (scene.height, scene.width), cfg.evaluation.chunk_pixels, module.codes.weight.detach()
+    pictures.write_strip(run_dir / "strip.png", module.field, codes, scene.endpoints, size, chunk)
+    film = path(codes, list(scene.endpoints), cfg.logging.frames - 1)
+    pictures.write_film(run_dir / "interpolation.mp4", module.field, film, size, chunk)
+    pictures.plot_error(run_dir / "error_vs_time.png", errors.rows, f"{scene.name}, model={cfg.model.name}")
+
+
+def summary(metrics: dict[str, Any], run_dir: Path) -> str:
+    """The result in a few lines, with the places to look."""
+    lines = []
+    for kind, text in (("known", "known views"), ("novel", "probes")):
+        if (found := metrics[kind])["per_view"]:
+            psnr = "no finite PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"
+            ssim = "no SSIM" if found["ssim"] is None else f"SSIM {found['ssim']:.4f}"
+            lines.append(f"{text:12} {psnr}  {ssim}")
+    lines.append(f"{metrics['steps']} steps in {metrics['training_seconds']:.1f} training seconds"
+                 f" ({metrics['wall_seconds']:.1f} wall)")  # fmt: skip
+    lines.append(f"{run_dir}/: strip.png, interpolation.mp4, error_vs_time.png, metrics.json")
+    return "\n".join(lines)
+
+
+def write_json(file: Path, values: dict[str, Any]) -> None:
+    """Writes beside, then puts in place; NaN and infinity are refused."""
+    part = file.with_suffix(".part")
+    part.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n")
+    os.replace(part, file)
+
+
+def main() -> None:
+    """The door: a new run through Hydra, or `resume=RUN_DIR` in that run's own folder."""
+    resumed = [a.partition("=")[2] for a in sys.argv[1:] if a.startswith("resume=")]
+    if resumed:
+        others = [a for a in sys.argv[1:] if not a.startswith("resume=")]
+        try:
+            cfg = config.read_run(resumed[0], others)
+            if not (Path(resumed[0]) / "checkpoints" / "last.ckpt").is_file():
+                raise ConfigError(f"{resumed[0]} has no checkpoint to go on from")
+            train(cfg, Path(resumed[0]), resume=True)
+        except UserError as error:
+            sys.exit(f"{type(error).__name__}: {error}")
+        return
+    command.main(TrainConfig, "train", train, ABOUT, TrainConfig(model=PaperModel(name="paper")))
+
+
+if __name__ == "__main__":
+    main()

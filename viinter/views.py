@@ -1,0 +1,78 @@
+"""Drawing views of a field, and measuring them against the known views and probes of a scene.
+
+Notation: a view is [H, W, 3] in [0, 1]; pixel j of W sits at x = -1 + 2j/W. A field maps `xy` [V, P, 2] and codes
+[V, M] to rgb [V, P, 3]. Nothing here knows about training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor, nn
+
+from viinter import metrics
+from viinter.codes import mix
+from viinter.scenes import Scene
+
+
+def pixel_grid(
+    height: int, width: int, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """Coordinates [H * W, 2] of all pixels in row order, x first, in [-1, 1)."""
+    y = -1 + 2 * torch.arange(height, device=device, dtype=dtype) / height
+    x = -1 + 2 * torch.arange(width, device=device, dtype=dtype) / width
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
+
+
+@torch.no_grad()
+def draw(field: nn.Module, z: Tensor, height: int, width: int, chunk_pixels: int = 131_072) -> Tensor:
+    """The view [H, W, 3] float32 (not clamped) that `field` shows under the code `z` [M], `chunk_pixels` at a time.
+
+    The field is continuous, so any size can be drawn; memory grows with `chunk_pixels`, not with the size.
+    """
+    rows = max(1, chunk_pixels // width)
+    parts = []
+    grid = pixel_grid(height, width, z.device, torch.promote_types(z.dtype, torch.float32))
+    for xy in grid.split(rows * width):
+        parts.append(field(xy[None], z[None])[0].float())
+    return torch.cat(parts).reshape(height, width, 3)
+
+
+def measure(
+    field: nn.Module,
+    codes: Tensor,
+    scene: Scene,
+    kinds: list[str] | None = None,
+    chunk_pixels: int = 131_072,
+    seen: Callable[[str, int, Tensor, Tensor], None] | None = None,
+) -> dict[str, dict]:
+    """Errors of the known views ("known") and of the scene's probes ("novel", ...), each as `metrics.summary`.
+
+    Args:
+        field: the field; its own mode and precision are used as they are.
+        codes: the code book [n, M].
+        scene: views and probes.
+        kinds: which of "known" and the kinds of `scene.probes`; None for all.
+        chunk_pixels: pixels drawn at a time.
+        seen: called with (kind, index, image, target) for every view drawn, for pictures or a progress bar.
+    """
+    found = {}
+    for kind in kinds or ["known", *scene.probes]:
+        errors = {}
+        for index, (name, z, target) in enumerate(_targets(codes, scene, kind)):
+            image = draw(field, z, scene.height, scene.width, chunk_pixels)
+            target = target.to(image.device)
+            if seen:
+                seen(kind, index, image, target)
+            errors[name] = metrics.compare(image, target)
+        found[kind] = metrics.summary(errors)
+    return found
+
+
+def _targets(codes: Tensor, scene: Scene, kind: str) -> Iterator[tuple[str, Tensor, Tensor]]:
+    if kind == "known":
+        yield from zip(scene.names, codes, scene.views, strict=True)
+    else:
+        for probe in scene.probes[kind]:
+            yield probe.name, mix(codes, probe.mix), probe.target
