@@ -221,7 +221,9 @@ class ErrorClock(L.Callback):
         now = self.clock.seconds
         if now < self.next or trainer.should_stop:
             return
-        if self.spent + self.longest > self.cfg.max_share * now:
+        if not self.longest:
+            self.longest = self._estimate(trainer, module)
+        if self.spent + self.longest >= self.cfg.max_share * now:
             self.next = (self.spent + self.longest) / self.cfg.max_share if self.cfg.max_share else math.inf
             return
         self.evaluate(trainer, module, ["known", "novel"])
@@ -254,6 +256,14 @@ class ErrorClock(L.Callback):
             took = time.perf_counter() - begin
             self.spent, self.longest = self.spent + took, max(self.longest, took)
         return found
+
+    def _estimate(self, trainer: L.Trainer, module: ViewInterpolator) -> float:
+        """Seconds that a measurement will take, from drawing one view."""
+        with self.clock.paused(), trainer.strategy.precision_plugin.forward_context():
+            begin = time.perf_counter()
+            z = module.codes.weight[0].detach()
+            draw(module.field, z, self.scene.height, self.scene.width, self.cfg.chunk_pixels).sum().item()
+            return (time.perf_counter() - begin) * (self.scene.n + len(self.scene.probes["novel"]))
 
     def _seen(self, kind: str, index: int, image: Tensor, target: Tensor) -> None:
         for listener in self.listeners:

@@ -13,6 +13,7 @@ import platform
 import resource
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +51,16 @@ Trains one field and one code for each image of a scene, and draws the views bet
 """
 
 
-def train(cfg: TrainConfig, run_dir: Path, resume: bool = False) -> dict[str, Any]:
+def train(
+    cfg: TrainConfig, run_dir: Path, resume: bool = False, more_callbacks: Sequence[L.Callback] = ()
+) -> dict[str, Any]:
     """Trains on a scene and fills the run folder.
 
     Args:
         cfg: all settings.
         run_dir: where everything is written.
         resume: go on from `run_dir/checkpoints/last.ckpt`.
+        more_callbacks: run after ours at every hook.
 
     Returns:
         What `metrics.json` holds: plain numbers, lists and strings.
@@ -90,7 +94,7 @@ def train(cfg: TrainConfig, run_dir: Path, resume: bool = False) -> dict[str, An
     if cfg.logging.progress:
         callbacks.append(ProgressBar(budget, clock, errors))
     checkpoint = SaveCheckpoint(cfg.checkpoint.every_seconds, clock, run_dir)
-    callbacks.append(checkpoint)
+    callbacks += [checkpoint, *more_callbacks]
 
     trainer = L.Trainer(
         **config.plain(cfg.trainer),

@@ -1,0 +1,62 @@
+"""Pixel batches."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from viinter.config import PixelsFrom
+from viinter.data import PixelStore
+
+CPU = torch.device("cpu")
+
+
+def numbered(n: int, height: int, width: int) -> torch.Tensor:
+    """Views whose every pixel holds (view, row, column)."""
+    view, row, column = torch.meshgrid(torch.arange(n), torch.arange(height), torch.arange(width), indexing="ij")
+    return torch.stack([view, row, column], -1).float()
+
+
+@given(st.integers(1, 40), st.integers(1, 30), st.integers(1, 30), st.integers(1, 64), st.sampled_from(PixelsFrom))
+def test_every_pixel_comes_with_its_own_coordinates_and_view(n, height, width, pixels, pixels_from):
+    store = PixelStore(numbered(n, height, width), pixels, pixels_from, 0, CPU)
+    batch = store.batch(5)
+    view, row, column = batch.rgb.unbind(-1)
+    assert torch.equal(view, batch.view[:, None].expand_as(view).float())
+    assert torch.allclose(batch.xy[..., 0], -1 + 2 * column / width, atol=1e-6)
+    assert torch.allclose(batch.xy[..., 1], -1 + 2 * row / height, atol=1e-6)
+    assert batch.xy.min() >= -1
+    assert batch.xy.max() < 1
+    assert batch.rgb.shape[0] * batch.rgb.shape[1] >= pixels
+
+
+def test_one_view_takes_all_pixels_from_one_view_and_all_views_the_same_share_from_each():
+    views = numbered(5, 8, 8)
+    one = PixelStore(views, 100, PixelsFrom.one_view, 0, CPU).batch(0)
+    assert one.rgb.shape == (1, 100, 3)
+    every = PixelStore(views, 100, PixelsFrom.all_views, 0, CPU).batch(0)
+    assert every.view.tolist() == [0, 1, 2, 3, 4]
+    assert every.rgb.shape == (5, 20, 3)
+
+
+def test_a_batch_depends_on_seed_and_number_alone():
+    views = numbered(5, 8, 8)
+    first, again = (PixelStore(views, 50, PixelsFrom.one_view, 7, CPU) for _ in range(2))
+    for k in range(5):
+        first.batch(k)
+    assert torch.equal(first.batch(3).xy, again.batch(3).xy)
+    assert not torch.equal(again.batch(3).xy, again.batch(4).xy)
+    assert not torch.equal(again.batch(3).xy, PixelStore(views, 50, PixelsFrom.one_view, 8, CPU).batch(3).xy)
+
+
+@pytest.mark.parametrize("pixels_from", PixelsFrom)
+def test_views_and_pixels_are_drawn_evenly(pixels_from):
+    store = PixelStore(numbered(4, 5, 6), 60, pixels_from, 0, CPU)
+    counts = torch.zeros(4, 5, 6)
+    for k in range(2000):
+        view, row, column = store.batch(k).rgb.long().flatten(0, 1).unbind(-1)
+        counts.index_put_((view, row, column), torch.ones(len(view)), accumulate=True)
+    share = counts / counts.sum()
+    if pixels_from is PixelsFrom.one_view:
+        assert torch.allclose(share.sum((1, 2)), torch.full((4,), 0.25), atol=0.05)
+    assert torch.allclose(share.sum(0), torch.full((5, 6), 1 / 30), atol=0.003)

@@ -1,0 +1,61 @@
+"""Drawing and measuring, with a field that is known in closed form."""
+
+import torch
+
+from viinter.config import Layout
+from viinter.scenes import Probe, Scene
+from viinter.views import draw, measure, pixel_grid
+
+
+class Ramp(torch.nn.Module):
+    """rgb = (x, y, z_0), so that every pixel tells where and under which code it was drawn."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[int] = []
+
+    def forward(self, xy: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        self.calls.append(xy.shape[1])
+        return torch.cat([xy, z[:, None, :1].expand(-1, xy.shape[1], -1)], -1)
+
+
+def test_pixel_j_of_w_sits_at_minus_one_plus_two_j_over_w_x_first():
+    grid = pixel_grid(2, 4)
+    assert grid[:4].tolist() == [[-1, -1], [-0.5, -1], [0, -1], [0.5, -1]]
+    assert grid[4].tolist() == [-1, 0]
+
+
+def test_a_view_is_the_same_in_chunks_and_no_chunk_is_larger_than_asked():
+    field, z = Ramp(), torch.tensor([0.3, 0.0])
+    whole = draw(field, z, 20, 12, 1000)
+    field.calls.clear()
+    parts = draw(field, z, 20, 12, 30)
+    assert torch.equal(whole, parts)
+    assert whole.shape == (20, 12, 3)
+    assert max(field.calls) <= 30
+    assert torch.allclose(whole[3, 5], torch.tensor([-1 + 10 / 12, -1 + 6 / 20, 0.3]), atol=1e-6)
+
+
+def test_measure_draws_known_views_from_their_codes_and_probes_from_their_mixes():
+    field = Ramp()
+    codes = torch.tensor([[0.2], [0.8]])
+    base = draw(field, torch.tensor([0.0]), 16, 16).clamp(0, 1)
+
+    def view(value: float) -> torch.Tensor:
+        image = base.clone()
+        image[..., 2] = value
+        return image
+
+    probes = {"novel": [Probe(view(0.35), ((0, 0.75), (1, 0.25)), "between.png")]}
+    scene = Scene(
+        name="ramp", layout=Layout.folder, views=torch.stack([view(0.2), view(0.8)]), names=["a.png", "b.png"],
+        probes=probes, left_out={"novel": 0}, white=1.0, endpoints=(0, 1), notes=[],
+    )  # fmt: skip
+    seen = []
+    found = measure(field, codes, scene, seen=lambda kind, k, *_: seen.append((kind, k)))
+    assert list(found["known"]["per_view"]) == ["a.png", "b.png"]
+    assert found["known"]["mse"] < 1e-12
+    assert found["novel"]["mse"] < 1e-12
+    assert seen == [("known", 0), ("known", 1), ("novel", 0)]
+    probes["novel"][0].target += 0.1
+    assert measure(field, codes, scene, ["novel"])["novel"]["mse"] > 1e-3

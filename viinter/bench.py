@@ -1,0 +1,157 @@
+"""`python -m viinter.bench step`: what the framework costs over the same step in a bare PyTorch loop.
+
+The two are timed in turns in one process: after every step of the real training, with all its callbacks, a twin of
+the model takes one step in plain PyTorch. Whatever the machine does meanwhile, it does to both.
+"""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+import torch.nn.functional as F
+from rich.console import Console
+from rich.table import Table
+
+from viinter import command
+from viinter.codes import CodeBook
+from viinter.config import PaperModel, TrainConfig
+from viinter.data import PixelStore
+from viinter.module import ViewInterpolator, make_field
+from viinter.train import train
+
+ABOUT = """
+Times a training step through viinter.train against the same step in a bare PyTorch loop, in turns in one process, and
+says where the time goes. Settings are those of viinter.train.
+
+  python -m viinter.bench step                                       width 128, depth 5, the shipped scene, 200 steps
+  python -m viinter.bench step model.width=512 model.depth=8 threads=2
+"""
+
+WARM_UP = 10
+
+
+class BareTwin(L.Callback):
+    """Takes a step of its own, in plain PyTorch, after each step of the training, and times both and their parts.
+
+    A step of the training lasts from the end of the one before to the moment this callback, the last, is called: data,
+    forward, backward, optimiser, every other callback, and Lightning's loop. `framework` [steps], `bare` [steps] and
+    `parts` hold seconds.
+    """
+
+    def __init__(self, cfg: TrainConfig) -> None:
+        self.cfg = cfg
+        self.framework: list[float] = []
+        self.bare: list[float] = []
+        self.parts: dict[str, list[float]] = defaultdict(list)
+
+    def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        scene, cfg = trainer.datamodule.scene, self.cfg
+        self.store = PixelStore(scene.views, cfg.optim.batch_pixels, cfg.optim.pixels_from, cfg.seed, module.device)
+        self.field = make_field(cfg.model).to(module.device)
+        self.codes = CodeBook(scene.n, cfg.model.code_dim, module.codes.p, module.codes.radius).to(module.device)
+        weights = [*self.field.parameters(), self.codes.weight]
+        self.optimizer = torch.optim.Adam(weights, lr=cfg.optim.lr, fused=True)
+        for callback in trainer.callbacks:
+            if callback is not self:
+                self._time(callback, "on_train_batch_start")
+                self._time(callback, "on_train_batch_end")
+        self.since = self._now(module.device)
+
+    def _time(self, callback: L.Callback, hook: str) -> None:
+        inner, name = getattr(callback, hook), f"callback {type(callback).__name__}"
+
+        def timed(*args: Any) -> None:
+            begin = time.perf_counter()
+            inner(*args)
+            self.parts[name].append(time.perf_counter() - begin)
+
+        if getattr(type(callback), hook) is not getattr(L.Callback, hook):
+            setattr(callback, hook, timed)
+
+    @staticmethod
+    def _now(device: torch.device) -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
+        marks = [self._now(module.device)]
+        self.framework.append(marks[0] - self.since)
+
+        def mark() -> None:
+            marks.append(self._now(module.device))
+
+        batch = self.store.batch(trainer.global_step)
+        mark()
+        loss = F.mse_loss(self.field(batch.xy, self.codes.weight[batch.view]), batch.rgb)
+        mark()
+        self.optimizer.zero_grad()
+        loss.backward()
+        mark()
+        self.optimizer.step()
+        mark()
+        self.codes.project_()
+        mark()
+        self.bare.append(marks[-1] - marks[0])
+        names = ("sampling", "forward", "backward", "optimiser", "code projection")
+        for name, (begin, end) in zip(names, itertools.pairwise(marks), strict=True):
+            self.parts[name].append(end - begin)
+        self.since = self._now(module.device)
+
+
+def step(cfg: TrainConfig) -> dict[str, Any]:
+    """Median seconds of a step through `train` and in the bare loop, their ratio, and the parts; printed as a table."""
+    twin = BareTwin(cfg)
+    with tempfile.TemporaryDirectory() as folder:
+        train(cfg, Path(folder), more_callbacks=[twin])
+    framework, bare = (statistics.median(times[WARM_UP:]) for times in (twin.framework, twin.bare))
+    ratios = sorted(a / b for a, b in zip(twin.framework[WARM_UP:], twin.bare[WARM_UP:], strict=True))
+    found = {
+        "framework_seconds": framework, "bare_seconds": bare, "ratio": framework / bare,
+        "ratio_quartiles": [ratios[len(ratios) // 4], ratios[3 * len(ratios) // 4]],
+        "steps": len(twin.framework) - WARM_UP, "threads": torch.get_num_threads(),
+        # a callback that acts now and then counts by its mean: its median would be nothing
+        "parts": {name: statistics.mean(times[WARM_UP:]) for name, times in twin.parts.items()},
+    }  # fmt: skip
+    table = Table(title=f"{found['steps']} steps of each, in turns, {found['threads']} threads", title_justify="left")
+    table.add_column("")
+    table.add_column("ms", justify="right")
+    table.add_column("share of the bare step", justify="right")
+    table.add_row("through viinter.train (median)", f"{1e3 * framework:.3f}", f"{framework / bare:.1%}")
+    table.add_row("bare PyTorch loop (median)", f"{1e3 * bare:.3f}", "100.0%")
+    for name, seconds in found["parts"].items():
+        table.add_row(f"  {name} (mean)", f"{1e3 * seconds:.3f}", f"{seconds / bare:.1%}")
+    console = Console()
+    console.print(table)
+    low, high = found["ratio_quartiles"]
+    console.print(f"ratio {found['ratio']:.3f} (quartiles of the pairs {low:.3f} to {high:.3f})", highlight=False)
+    return found
+
+
+BENCHES = {"step": step}
+PRESETS = {"step": ["model.width=128", "model.depth=5", "optim.steps=210", "logging.pictures=false",
+                    "evaluation.max_share=0"]}  # fmt: skip
+
+
+def main() -> None:
+    """`python -m viinter.bench WHAT key=value ...`."""
+    asked = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if asked not in BENCHES and asked not in ("--help", "-h"):
+        sys.exit(f"{asked}: there is no such bench. There are: {', '.join(BENCHES)}")
+    if asked in BENCHES:
+        no_folder = ["hydra.run.dir=.", "hydra.output_subdir=null"]
+        sys.argv = [sys.argv[0], *PRESETS[asked], *no_folder, *sys.argv[2:]]
+    command.main(TrainConfig, "train", lambda cfg, _: BENCHES[asked](cfg), ABOUT, TrainConfig(model=PaperModel()))
+
+
+if __name__ == "__main__":
+    main()
