@@ -20,7 +20,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 from torch.utils.tensorboard import SummaryWriter
@@ -381,8 +381,8 @@ class ProgressBar(L.Callback):
     def __init__(self, budget: Budget, clock: Clock, errors: ErrorClock) -> None:
         self.budget, self.clock, self.errors, self.next = budget, clock, errors, 0.0
         self.bar = Progress(
-            TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.percentage:5.1f} %"),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[numbers]}"),
+            TextColumn("{task.description}"), BarColumn(20), TextColumn("{task.percentage:3.0f} %"),
+            TimeRemainingColumn(compact=True), TextColumn("{task.fields[numbers]}"),
         )  # fmt: skip
 
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
@@ -399,12 +399,12 @@ class ProgressBar(L.Callback):
             return
         self.next = now + 0.5
         loss = outputs["loss"].item()
-        numbers = f"step {trainer.global_step}  loss {loss:.2e}"
+        numbers = f"step {trainer.global_step} loss {loss:.1e}"
         if loss > 0:
-            numbers += f"  batch {-10 * math.log10(loss):.1f} dB"
+            numbers += f" {-10 * math.log10(loss):.1f} dB"
         if self.errors.rows:
             row = self.errors.rows[-1]
-            numbers += "".join(f"  {k} {row[f'{k}_psnr']:.1f} dB" for k in ("known", "novel") if row[f"{k}_psnr"])
+            numbers += "".join(f" {k} {row[f'{k}_psnr']:.1f} dB" for k in ("known", "novel") if row[f"{k}_psnr"])
         self.bar.update(self.task, completed=self.budget.progress(trainer), numbers=numbers, description="training")
 
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:

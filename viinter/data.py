@@ -6,6 +6,7 @@ x = -1 + 2j/W.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -56,18 +57,15 @@ class PixelStore:
         return PixelBatch(view, xy, self.rgb[pixel + view[:, None] * (self.height * self.width)])
 
 
-class _Batches:
-    """An endless iterable of batches, starting where the trainer stands. It has no state of its own: its
+class _Numbers:
+    """The endless numbers of the batches, starting where the trainer stands. It has no state of its own: its
     `state_dict` is there to tell Lightning that it can be resumed."""
 
-    def __init__(self, store: PixelStore, trainer: L.Trainer) -> None:
-        self.store, self.trainer = store, trainer
+    def __init__(self, trainer: L.Trainer) -> None:
+        self.trainer = trainer
 
-    def __iter__(self) -> Iterator[PixelBatch]:
-        k = self.trainer.global_step
-        while True:
-            yield self.store.batch(k)
-            k += 1
+    def __iter__(self) -> Iterator[int]:
+        return itertools.count(self.trainer.global_step)
 
     def state_dict(self) -> dict:
         return {}
@@ -80,18 +78,20 @@ class SceneData(L.LightningDataModule):
     """Serves the known views of a scene (any layout) as an endless stream of `PixelBatch`es on the training device.
 
     There are no workers and no copies: a scene's pixels fit any device that can train on them, and a worker that ships
-    them costs more than a training step.
+    them costs more than a training step. The loader gives only a batch's number and the batch is drawn on arrival,
+    because Lightning would round what a loader gives to `trainer.precision`, coordinates and targets too.
     """
 
     def __init__(self, scene: Scene, batch_pixels: int, pixels_from: PixelsFrom, seed: int) -> None:
         super().__init__()
         self.scene, self.batch_pixels, self.pixels_from, self.seed = scene, batch_pixels, pixels_from, seed
 
-    def train_dataloader(self) -> _Batches:
+    def train_dataloader(self) -> _Numbers:
         device = self.trainer.strategy.root_device
         # every process of a distributed run draws pixels of its own
         seed = self.seed + 1_000_003 * self.trainer.global_rank
-        return _Batches(PixelStore(self.scene.views, self.batch_pixels, self.pixels_from, seed, device), self.trainer)
+        self.store = PixelStore(self.scene.views, self.batch_pixels, self.pixels_from, seed, device)
+        return _Numbers(self.trainer)
 
-    def transfer_batch_to_device(self, batch: PixelBatch, device: torch.device, dataloader_idx: int) -> PixelBatch:
-        return batch  # it was made there
+    def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> PixelBatch:
+        return self.store.batch(batch)
