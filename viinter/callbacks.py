@@ -395,10 +395,11 @@ class ProgressBar(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, outputs: Any, *_: Any) -> None:
         now = time.perf_counter()
-        if now < self.next:
-            return
-        self.next = now + 0.5
-        loss = outputs["loss"].item()
+        if now >= self.next or trainer.should_stop:
+            self.next = now + 0.5
+            self._show(trainer, outputs["loss"].item())
+
+    def _show(self, trainer: L.Trainer, loss: float) -> None:
         numbers = f"step {trainer.global_step} loss {loss:.1e}"
         if loss > 0:
             numbers += f" {-10 * math.log10(loss):.1f} dB"
@@ -408,7 +409,7 @@ class ProgressBar(L.Callback):
         self.bar.update(self.task, completed=self.budget.progress(trainer), numbers=numbers, description="training")
 
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
-        self.bar.update(self.task, completed=1.0, description="training")
+        self.bar.update(self.task, description="training")
         self.bar.stop()
 
     def on_exception(self, trainer: L.Trainer, module: ViewInterpolator, exception: BaseException) -> None:

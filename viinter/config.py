@@ -271,7 +271,9 @@ class DownloadConfig:
 MODELS = {"paper": PaperModel}
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-OmegaConf.register_new_resolver("repository", lambda: str(REPOSITORY), replace=True)  # used by conf/scene/demo.yaml
+# for conf/scene/demo.yaml, and for conf/train.yaml's folder of a sweep
+OmegaConf.register_new_resolver("repository", lambda: str(REPOSITORY), replace=True)
+OmegaConf.register_new_resolver("either", lambda first, otherwise: first or otherwise, replace=True)
 
 
 def norm_order(p: str | float) -> float | None:

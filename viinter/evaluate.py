@@ -22,7 +22,7 @@ from viinter.config import ConfigError, EvaluateConfig
 from viinter.data import PixelStore
 from viinter.module import load, run_device
 from viinter.scenes import Probe
-from viinter.train import describe, write_json
+from viinter.train import about, describe, write_json
 from viinter.views import draw, measure
 
 ABOUT = """
@@ -49,7 +49,7 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
     trained = config.read_run(cfg.run, [f"paths.data={cfg.data}"] if cfg.data else [])
     model = load(cfg.run, run_device(cfg.accelerator))
     scene = scenes.load(trained.scene)
-    if scene.names != model.about["names"]:
+    if about(scene) != model.about:
         raise ConfigError(f"{trained.scene.root} no longer holds the known views that {cfg.run} was trained on")
     console.print(describe(scene))
     codes = model.codes.weight.detach()
@@ -70,7 +70,7 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
         shown = [f"{values[k]:.{d}f} {unit}" for k, d, unit in (("psnr", 2, "dB"), ("ssim", 4, "SSIM"))
                  if values[k] is not None]  # fmt: skip
         console.print(f"{kind:16} {len(values['per_view']):4} views  {'  '.join(shown)}", highlight=False)
-    console.print(f"written: {Path(cfg.run) / 'evaluation.json'}", highlight=False)
+    console.print(f"written: {Path(cfg.run) / 'evaluation.json'}", highlight=False, soft_wrap=True)
     return found
 
 

@@ -44,17 +44,19 @@ def render(cfg: RenderConfig) -> dict[str, Any]:
         torch.set_num_threads(cfg.threads)
     model = load(cfg.run, run_device(cfg.accelerator))
     about, book = model.about, model.codes.weight.detach()
-    size = cfg.size or [about["height"], about["width"]]
+    size = [about["height"], about["width"]] if cfg.size is None else cfg.size
     if len(size) != 2 or min(size) < 1:
         raise ConfigError(f"size={size}: expected [height,width], both above 0")
     if cfg.frames < 1 or cfg.side < 2 or cfg.fps <= 0 or cfg.chunk_pixels < 1:
         raise ConfigError(f"frames={cfg.frames} side={cfg.side} fps={cfg.fps} chunk_pixels={cfg.chunk_pixels}: "
                           "expected at least 1, 2, above 0, 1")  # fmt: skip
-    views = cfg.corners or cfg.path or about["endpoints"]
+    if cfg.path is not None and cfg.corners is not None:
+        raise ConfigError(f"path={cfg.path} and corners={cfg.corners}: expected one of the two")
+    views = next(v for v in (cfg.corners, cfg.path, about["endpoints"]) if v is not None)
     unknown = [v for v in views if not 0 <= v < len(book)]
     if unknown:
         raise ConfigError(f"view {unknown[0]} is not one of the {len(book)} known views, 0 to {len(book) - 1}")
-    if cfg.corners and len(cfg.corners) != 4:
+    if cfg.corners is not None and len(cfg.corners) != 4:
         raise ConfigError(f"corners={cfg.corners}: expected four known views")
     if len(views) < 2:
         raise ConfigError(f"path={cfg.path}: expected two or more known views")
@@ -77,7 +79,7 @@ def render(cfg: RenderConfig) -> dict[str, Any]:
         rows = [torch.cat([draw(model.field, z, *size, cfg.chunk_pixels) for z in row], 1)
                 for row in square(book[views], cfg.side)]  # fmt: skip
         image.write(out / "sheet.png", torch.cat(rows).clamp(0, 1).cpu())
-    console.print(f"{len(film)} frames of {size[0]} x {size[1]}: {out}", highlight=False)
+    console.print(f"{len(film)} frames of {size[0]} x {size[1]}: {out}", highlight=False, soft_wrap=True)
     return {"out": str(out), "frames": len(film), "height": size[0], "width": size[1]}
 
 

@@ -115,7 +115,7 @@ def train(
     (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
     if cfg.logging.pictures:
         show(cfg, scene, module, errors, run_dir)
-    console.print(summary(metrics, run_dir))
+    console.print(summary(metrics, run_dir), soft_wrap=True)
     return metrics
 
 
@@ -190,7 +190,8 @@ def summary(metrics: dict[str, Any], run_dir: Path) -> str:
             lines.append(f"{text:12} {psnr}  {ssim}")
     lines.append(f"{metrics['steps']} steps in {metrics['training_seconds']:.1f} training seconds"
                  f" ({metrics['wall_seconds']:.1f} wall)")  # fmt: skip
-    lines.append(f"{run_dir}/: strip.png, interpolation.mp4, error_vs_time.png, metrics.json")
+    shown = ("strip.png", "interpolation.mp4", "error_vs_time.png", "metrics.json")
+    lines.append(f"{run_dir}: " + ", ".join(name for name in shown if (run_dir / name).exists()))
     return "\n".join(lines)
 
 
