@@ -56,7 +56,7 @@ class BareTwin(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         scene, cfg = trainer.datamodule.scene, self.cfg
         self.store = PixelStore(scene.views, cfg.optim.batch_pixels, cfg.optim.pixels_from, cfg.seed, module.device)
-        self.field = make_field(cfg.model).to(module.device)
+        self.field = make_field(cfg.model, scene.n, scene.height, scene.width).to(module.device)
         self.codes = CodeBook(scene.n, cfg.model.code_dim, module.codes.p, module.codes.radius).to(module.device)
         weights = [*self.field.parameters(), self.codes.weight]
         self.optimizer = torch.optim.Adam(weights, lr=cfg.optim.lr, fused=True)

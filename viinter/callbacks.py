@@ -108,15 +108,20 @@ class Budget(L.Callback):
         trainer.should_stop = self.progress(trainer) >= 1
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
-        factor = self.factor(self.progress(trainer))
-        for group in trainer.optimizers[0].param_groups:
-            group["lr"] = group["initial_lr"] * factor
+        progress = self.progress(trainer)
+        module.field.at(progress)
+        factor = self.factor(progress)
+        for group, rate in zip(trainer.optimizers[0].param_groups, module.field.rates(), strict=True):
+            group["lr"] = group["initial_lr"] * factor * rate
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         if self.progress(trainer) >= 1:
             trainer.should_stop = True
 
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        store = trainer.datamodule.store
+        views = store.rgb.view(store.n, store.height, store.width, 3)
+        module.field.finish(views, module.codes.weight.detach())
         self.clock.stop()
 
     def state_dict(self) -> dict[str, float]:

@@ -135,5 +135,5 @@ def main(
 
     try:
         job()
-    except KeyboardInterrupt:
-        sys.exit("interrupted")
+    except KeyboardInterrupt as interrupt:
+        sys.exit(str(interrupt) or "interrupted")

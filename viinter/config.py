@@ -72,6 +72,7 @@ class PixelsFrom(Enum):
 
     one_view = "one_view"
     all_views = "all_views"
+    rows = "rows"
 
 
 @dataclass
@@ -118,7 +119,7 @@ class CodesConfig:
 class ModelConfig:
     """What all fields share; `conf/model/NAME.yaml` chooses one of the classes below."""
 
-    name: str = setting(MISSING, "paper")
+    name: str = setting(MISSING, "paper or fast")
     code_dim: int = setting(128, "M, the length of a code (supplement: 128)")
 
 
@@ -134,13 +135,27 @@ class PaperModel(ModelConfig):
 
 
 @dataclass
+class FastModel(ModelConfig):
+    """Layers of texture carried by a learned motion (`fields/fast.py`)."""
+
+    layers: int = setting(8, "surfaces that the scene is made of")
+    motion: int = setting(6, "motion polynomials: 1 shifts, 3 adds turns and zooms, 6 adds perspective")
+    margin: float = setting(1.1, "size of a texture in views, for what moves in from outside")
+    sharpness: float = setting(5.0, "scale of the layers' weights in their softmax")
+    entropy: float = setting(1e-3, "weight of the penalty on pixels that mix layers")
+    disparity_scale: int = setting(4, "pixels to an entry of the disparity maps")
+    remainder: bool = setting(True, "keep what the layers leave over of each known view, and share it out")
+
+
+@dataclass
 class OptimConfig:
     steps: int = setting(300_000, "training steps, unless training_seconds is given")
     training_seconds: float | None = setting(None, "budget in training seconds; takes the place of steps")
     lr: float = setting(1e-5, "learning rate of Adam at the start (supplement: 1e-5)")
     lr_decay: float = setting(0.1, "rate at the end, as a share of the first; cosine between (supplement: 0.1)")
+    beta2: float = setting(0.999, "Adam's decay of squared gradients (PyTorch's default)")
     batch_pixels: int = setting(8192, "pixels a step (supplement: 8192)")
-    pixels_from: PixelsFrom = setting(PixelsFrom.one_view, "one random view a step (code), or all views together")
+    pixels_from: PixelsFrom = setting(PixelsFrom.one_view, "one random view (code), all views, or whole rows")
 
 
 @dataclass
@@ -268,7 +283,7 @@ class DownloadConfig:
     paths: Paths = setting(Paths(), "folders")
 
 
-MODELS = {"paper": PaperModel}
+MODELS = {"paper": PaperModel, "fast": FastModel}
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 # for conf/scene/demo.yaml, and for conf/train.yaml's folder of a sweep
@@ -310,13 +325,17 @@ def check(cfg: TrainConfig) -> None:
         "evaluation.chunk_pixels": cfg.evaluation.chunk_pixels, "logging.every_seconds": cfg.logging.every_seconds,
         "checkpoint.every_seconds": cfg.checkpoint.every_seconds,
     }  # fmt: skip
-    for key in ("width", "depth", "first_omega", "hidden_omega"):
+    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "margin", "sharpness", "disparity_scale"):
         if hasattr(cfg.model, key):
             positive[f"model.{key}"] = getattr(cfg.model, key)
     for key, value in positive.items():
         want(value > 0 and math.isfinite(value), key, value, "a number above 0")
+    if isinstance(cfg.model, FastModel):
+        want(cfg.model.motion in (1, 3, 6), "model.motion", cfg.model.motion, "1, 3 or 6")
+        want(cfg.model.entropy >= 0, "model.entropy", cfg.model.entropy, "0 or more")
     want(cfg.interpolation.alpha >= 0, "interpolation.alpha", cfg.interpolation.alpha, "0 or more")
     want(0 < cfg.optim.lr_decay <= 1, "optim.lr_decay", cfg.optim.lr_decay, "above 0, at most 1")
+    want(0 <= cfg.optim.beta2 < 1, "optim.beta2", cfg.optim.beta2, "0 or more, below 1")
     want(cfg.evaluation.factor > 1, "evaluation.factor", cfg.evaluation.factor, "above 1")
     want(cfg.evaluation.max_share >= 0, "evaluation.max_share", cfg.evaluation.max_share, "0 or more")
     want(cfg.logging.frames >= 2, "logging.frames", cfg.logging.frames, "2 or more")

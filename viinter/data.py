@@ -31,7 +31,9 @@ class PixelStore:
 
     Batch k depends on `seed` and k alone, so that a resumed run goes on with the very batches it would have had.
     `one_view`: `pixels` of one random view (the published code). `all_views`: the same number spread evenly over
-    all views (over `pixels` of them, drawn at random, if there are more views than pixels).
+    all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: whole rows, evenly
+    spread over the frame and each of a random view, as many as come nearest to `pixels`; a field that reads textures
+    finds what it needs of them in the cache.
     """
 
     def __init__(self, views: Tensor, pixels: int, pixels_from: PixelsFrom, seed: int, device: torch.device) -> None:
@@ -45,6 +47,8 @@ class PixelStore:
     def batch(self, k: int) -> PixelBatch:
         """Batch number `k`."""
         random, device = self.generator.manual_seed((self.seed * 0x9E3779B1 + k) % 2**32), self.rgb.device
+        if self.pixels_from is PixelsFrom.rows:
+            return self._rows(random)
         if self.pixels_from is PixelsFrom.one_view:
             view, share = torch.randint(self.n, (1,), generator=random, device=device), self.pixels
         elif self.n <= self.pixels:
@@ -55,6 +59,15 @@ class PixelStore:
         row = torch.div(pixel, self.width, rounding_mode="floor")
         xy = torch.stack([pixel - row * self.width, row], -1) * self.pitch - 1
         return PixelBatch(view, xy, self.rgb[pixel + view[:, None] * (self.height * self.width)])
+
+    def _rows(self, random: torch.Generator) -> PixelBatch:
+        count, device = max(1, round(self.pixels / self.width)), self.rgb.device
+        view = torch.randint(self.n, (count,), generator=random, device=device)
+        spread = torch.arange(count, device=device) + torch.rand(count, generator=random, device=device)
+        row = (spread * (self.height / count)).long().clamp_(max=self.height - 1)
+        column = torch.arange(self.width, device=device).expand(count, -1)
+        xy = torch.stack([column, row[:, None].expand(-1, self.width)], -1) * self.pitch - 1
+        return PixelBatch(view, xy, self.rgb.view(-1, self.width, 3)[view * self.height + row])
 
 
 class _Numbers:

@@ -14,16 +14,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from viinter.codes import CodeBook
-from viinter.config import ConfigError, TrainConfig, from_plain, norm_order, plain
+from viinter.config import ConfigError, ModelConfig, TrainConfig, from_plain, norm_order, plain
 from viinter.data import PixelBatch
+from viinter.fields.fast import FastField
+from viinter.fields.field import Field
 from viinter.fields.paper import PaperField
 
 
-def make_field(cfg: Any) -> torch.nn.Module:
-    """The field that a model configuration (`config.MODELS`) describes."""
-    fields = {"paper": PaperField}
+def make_field(cfg: ModelConfig, n: int, height: int, width: int) -> Field:
+    """The field that a model configuration (`config.MODELS`) describes, for `n` views of `height` x `width`."""
     settings = {k: v for k, v in plain(cfg).items() if k != "name"}
-    return fields[cfg.name](**settings)
+    if cfg.name == "fast":
+        return FastField(views=n, height=height, width=width, **settings)
+    return PaperField(**settings)
 
 
 class ViewInterpolator(L.LightningModule):
@@ -41,22 +44,24 @@ class ViewInterpolator(L.LightningModule):
     def __init__(self, cfg: TrainConfig, n: int, about: dict[str, Any]) -> None:
         super().__init__()
         self.cfg, self.about = cfg, about
-        self.field = make_field(cfg.model)
+        self.field = make_field(cfg.model, n, about["height"], about["width"])
         self.codes = CodeBook(n, cfg.model.code_dim, norm_order(cfg.codes.p), cfg.codes.radius)
         self.codes.project_()
+        self.field.calibrate(self.codes.weight)
 
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
         """Colours [V, P, 3] of `xy` [V, P, 2] under codes `z` [V, M]."""
         return self.field(xy, z)
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
-        return F.mse_loss(self.field(batch.xy, self.codes.weight[batch.view]), batch.rgb)
+        return F.mse_loss(self.field(batch.xy, self.codes.weight[batch.view]), batch.rgb) + self.field.penalty()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam over field and codes (supplement); the rate is set before each step by `callbacks.Budget`."""
-        lr = self.cfg.optim.lr
-        parameters = [*self.field.parameters(), self.codes.weight]
-        return torch.optim.Adam([{"params": parameters, "initial_lr": lr}], lr=lr, fused=True)
+        groups = self.field.parameter_groups(self.codes.weight)
+        for group in groups:
+            group["initial_lr"] = self.cfg.optim.lr * group.pop("share")
+        return torch.optim.Adam(groups, lr=self.cfg.optim.lr, betas=(0.9, self.cfg.optim.beta2), fused=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["config"], checkpoint["about"] = plain(self.cfg), self.about

@@ -20,6 +20,7 @@ from typing import Any
 import lightning as L
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from rich.console import Console
 
 from viinter import command, config, features, pictures, scenes
@@ -67,6 +68,7 @@ def train(
 
     Raises:
         UserError: settings, images or weights that cannot be used; nothing has been trained then.
+        KeyboardInterrupt: after Ctrl-C, when the checkpoint has been written; its message says how to go on.
     """
     config.check(cfg)
     console = Console(quiet=not cfg.logging.progress)
@@ -96,19 +98,24 @@ def train(
     checkpoint = SaveCheckpoint(cfg.checkpoint.every_seconds, clock, run_dir)
     callbacks += [checkpoint, *more_callbacks]
 
-    trainer = L.Trainer(
-        **config.plain(cfg.trainer),
-        max_epochs=-1,
-        logger=TensorBoardLogger(run_dir, name="", version="", default_hp_metric=False),
-        callbacks=callbacks,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        use_distributed_sampler=False,
-    )
-    trainer.fit(module, data, ckpt_path=checkpoint.file if resume else None, weights_only=True)
-    if trainer.interrupted:
-        raise UserError(f"interrupted at step {trainer.global_step}; go on with: viinter.train resume={run_dir}")
+    try:
+        trainer = L.Trainer(
+            **config.plain(cfg.trainer),
+            max_epochs=-1,
+            logger=TensorBoardLogger(run_dir, name="", version="", default_hp_metric=False),
+            callbacks=callbacks,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+        )
+    except (ValueError, MisconfigurationException) as error:  # its message names the value and what is accepted
+        raise ConfigError(f"trainer.*: {error}") from error
+    try:
+        trainer.fit(module, data, ckpt_path=checkpoint.file if resume else None, weights_only=True)
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        step, again = trainer.global_step, f"python -m viinter.train resume={run_dir}"
+        raise KeyboardInterrupt(f"interrupted at step {step}" + (f"; go on with: {again}" if step else "")) from None
 
     metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
     write_json(run_dir / "metrics.json", metrics)
@@ -214,6 +221,8 @@ def main() -> None:
             train(cfg, Path(resumed[0]), resume=True)
         except UserError as error:
             sys.exit(f"{type(error).__name__}: {error}")
+        except KeyboardInterrupt as interrupt:
+            sys.exit(str(interrupt) or "interrupted")
         return
     command.main(TrainConfig, "train", train, ABOUT, TrainConfig(model=PaperModel(name="paper")))
 

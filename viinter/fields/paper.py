@@ -16,6 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from viinter.fields.field import Field
+
 
 class SineLayer(nn.Module):
     """`sin(omega (W x + b))`, then a LayerNorm if asked; [..., inputs] -> [..., outputs].
@@ -42,7 +44,7 @@ class SineLayer(nn.Module):
         return self.norm(sine.to(self.linear.weight.dtype))
 
 
-class PaperField(nn.Module):
+class PaperField(Field):
     """The field F(xy | z) -> rgb of the paper, Section 3.1 and 3.2, with the supplement's sizes."""
 
     def __init__(

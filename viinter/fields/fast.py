@@ -1,0 +1,185 @@
+"""The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
+
+Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `L` layers, `K` motion
+polynomials. A layer has a texture [4, h, w] (rgb and a weight) at about the resolution of a view, and a disparity
+d_l(u) = d_l + delta_l(u) with a coarser map delta_l. Under the code z the pixel xy reads layer l at
+
+    u_l = xy + a(xy, z) + d_l(u) b(xy, z),      a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
+
+phi = {1, x, y, x^2, xy, y^2}, and a_k, b_k linear in z. That is the image motion of a rigid scene under a small camera
+motion (Longuet-Higgins and Prazdny 1980): `a` the part that a rotation gives every depth alike, `b` the part that a
+translation gives in proportion to inverse depth. Nothing is told to it: a_k(z), b_k(z), the disparities and the
+textures are all learned from the pixels. Since the motion is linear in z, a mix of codes moves each surface half way
+where a cross-fade would show it twice.
+
+The colour is the mean of the layers' colours, weighted by a softmax of their weights: not an alpha compositing, which
+trained more slowly and worse. Layered textures read through a homography are the multi-plane images of Zhou et al.
+2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
+
+What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
+view's remainder, read where the motion takes it, and shared among the known views nearest in motion.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from viinter.fields.field import Field
+
+COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
+NEAREST = 4  # known views that share in a remainder
+REACH = 0.7  # how far a known view's remainder reaches, in distances between neighbouring views
+
+
+class FastField(Field):
+    """F(xy | z) -> rgb from `layers` textures for `views` known views of `height` x `width`.
+
+    Coarse to fine: textures are sums of levels, each twice as fine as the one before. `at(progress)` chooses the level
+    in training; those before it are kept as they are, those after it do not take part. See `config.FastModel` for the
+    other arguments.
+    """
+
+    def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, motion: int, margin: float,
+                 sharpness: float, entropy: float, disparity_scale: int, remainder: bool) -> None:  # fmt: skip
+        super().__init__()
+        self.margin, self.sharpness, self.entropy, self.motion = margin, sharpness, entropy, motion
+        count = max(0, math.ceil(math.log2(min(height, width) / COARSEST))) + 1
+        sizes = [(round(height * margin / 2**k), round(width * margin / 2**k)) for k in reversed(range(count))]
+        self.levels = nn.ParameterList(torch.zeros(layers, 4, max(2, h), max(2, w)) for h, w in sizes)
+        size = [max(4, round(s / disparity_scale)) for s in sizes[-1]]
+        self.delta = nn.Parameter(torch.zeros(layers, 1, *size))
+        self.disparity = nn.Parameter(torch.linspace(-1, 1, layers) if layers > 1 else torch.zeros(1))
+        self.shift = nn.Parameter(0.02 * torch.randn(4, code_dim) / math.sqrt(code_dim))
+        self.bend = nn.Parameter(torch.zeros(4 * (motion - 1), code_dim))
+        self.register_buffer("gain", torch.ones(()))
+        # half precision: a remainder is small, and a scene's memory should stay near that of its images
+        shape = (views, 3, height, width) if remainder else (0, 3, 1, 1)
+        self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
+        self.register_buffer("places", torch.zeros(shape[0], 4 * motion))
+        self.register_buffer("reach", torch.zeros(()))
+        self.level, self.decision = count - 1, 1.0
+        self.chosen: Tensor | None = None
+
+    def calibrate(self, codes: Tensor) -> None:
+        """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
+        self.gain.copy_(1 / codes.detach().norm(dim=-1).mean().clamp_min(1e-12))
+
+    def parameter_groups(self, codes: nn.Parameter) -> list[dict[str, Any]]:
+        """Textures, disparity maps, and three groups that move: what is far from 1 in `share` was found by trial."""
+        return [
+            {"params": list(self.levels), "share": 1.0},
+            {"params": [self.delta], "share": 0.5},
+            {"params": [self.shift, self.disparity], "share": 0.1},
+            {"params": [self.bend], "share": 0.025},
+            {"params": [codes], "share": 2.5 / self.gain.item()},
+        ]
+
+    def rates(self) -> list[float]:
+        """Whatever moves the textures slows down with the size of their pixels."""
+        moves = 0.5**self.level
+        return [1.0, 1.0, moves, moves, moves]
+
+    def at(self, progress: float) -> None:
+        """Chooses the level in training for the share of the budget that is used, in [0, 1].
+
+        The finest level has 70 % of the budget, the one before 18 %, the coarser ones share the rest. The penalty is
+        faded in over the finest level's first part: a decision made before the motion is known is often wrong.
+        """
+        self.reach.zero_()
+        count = len(self.levels)
+        coarse = count - 2
+        ends = [0.12 * (k + 1) / coarse for k in range(coarse)] + [0.30, 1.0]
+        self.level = next((k for k, end in enumerate(ends[-count:]) if progress < end), count - 1)
+        self.decision = min(max((progress - 0.3) / 0.3, 0.0), 1.0)
+
+    def textures(self) -> Tensor:
+        """The textures [L, 4, h, w] at the level in training."""
+        total = self.levels[0] if self.level == 0 else self.levels[0].detach()
+        for k in range(1, self.level + 1):
+            own = self.levels[k] if k == self.level else self.levels[k].detach()
+            total = F.interpolate(total, size=own.shape[-2:], mode="bilinear", align_corners=True) + own
+        return total
+
+    def place(self, z: Tensor) -> Tensor:
+        """The motion's coefficients [V, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
+        return F.linear(z * self.gain, torch.cat([self.shift, self.bend]))
+
+    def carry(self, xy: Tensor, place: Tensor) -> Tensor:
+        """The motions a and b [V, P, 4], in units of a texture, of pixels `xy` [V, P, 2]."""
+        x, y = xy.unbind(-1)
+        phi = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y][: self.motion], -1)
+        return phi @ place.view(-1, self.motion, 4) / self.margin
+
+    def forward(self, xy: Tensor, z: Tensor) -> Tensor:
+        """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped."""
+        place = self.place(z)
+        a, b = self.carry(xy, place).split(2, -1)
+        u = (xy / self.margin + a)[None] + self.disparity[:, None, None, None] * b[None]
+        disparity = self.disparity[:, None, None]
+        if self.level >= min(2, len(self.levels) - 1):
+            delta = sample(self.delta, u)[:, 0]
+            u, disparity = u + delta[..., None] * b[None], disparity + delta
+        read = sample(self.textures(), u)
+        weight = torch.softmax(self.sharpness * read[:, 3], 0)
+        if self.training and torch.is_grad_enabled():
+            self.chosen = weight
+        rgb = (weight[:, None] * read[:, :3]).sum(0).movedim(0, -1) + 0.5
+        if self.reach > 0:
+            rgb = rgb + self.left_over(xy, place, a, b, (weight * disparity).sum(0))
+        return rgb
+
+    def penalty(self) -> Tensor:
+        """How undecided the pixels of the last call were between layers: the mean of 1 - sum_l w_l^2, weighted."""
+        weight, self.chosen = self.chosen, None
+        return self.decision * self.entropy * (1 - weight.square().sum(0)).mean()
+
+    @torch.no_grad()
+    def finish(self, views: Tensor, codes: Tensor) -> None:
+        """Keeps what the layers leave over of the known views [n, H, W, 3] with codes [n, M]."""
+        if not len(self.remainder):
+            return
+        _, height, width, _ = views.shape
+        x = -1 + 2 * torch.arange(width, device=views.device) / width
+        y = -1 + 2 * torch.arange(height, device=views.device) / height
+        self.reach.zero_()
+        for k, view in enumerate(views):
+            for rows in torch.arange(height, device=views.device).split(max(1, 65_536 // width)):
+                xy = torch.stack(torch.meshgrid(x, y[rows], indexing="xy"), -1).flatten(0, 1)
+                drawn = self(xy[None], codes[k : k + 1])[0].view(len(rows), width, 3)
+                self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).half()
+        self.places.copy_(self.place(codes))
+        apart = torch.cdist(self.places, self.places)
+        apart.fill_diagonal_(math.inf)
+        self.reach.copy_(REACH * apart.amin(1).mean() if len(views) > 1 else torch.ones(()))
+
+    def left_over(self, xy: Tensor, place: Tensor, a: Tensor, b: Tensor, disparity: Tensor) -> Tensor:
+        """The known views' remainders [V, P, 3] at pixels that move by `a`, `b` and have the mean `disparity` [V, P].
+
+        A known view's share falls with the square of its distance in motion; what the first view that is left out
+        would have had is taken from all, so that a view enters and leaves a path without a jump.
+        """
+        near = torch.exp(-torch.cdist(place, self.places).square() / self.reach.square())
+        shares, views = near.topk(min(NEAREST + 1, near.shape[1]), -1)
+        if near.shape[1] > NEAREST:
+            shares, views = (shares - shares[:, -1:])[:, :-1], views[:, :-1]
+        shares = shares / shares.sum(-1, keepdim=True).clamp_min(1e-12)
+        _, _, height, width = self.remainder.shape
+        scale = xy.new_tensor([width, height]) / (xy.new_tensor([width, height]) - 1).clamp_min(1)
+        total = 0
+        for share, view in zip(shares.unbind(-1), views.unbind(-1), strict=True):
+            a_there, b_there = self.carry(xy, self.places[view]).split(2, -1)
+            there = xy + self.margin * ((a - a_there) + disparity[..., None] * (b - b_there))
+            there = (there + 1) * scale - 1  # pixel centres at both ends, as grid_sample counts
+            read = sample(self.remainder[view].to(there.dtype), there[:, None])[:, :, 0]
+            total = total + share[:, None, None] * read.movedim(1, -1)
+        return total
+
+
+def sample(maps: Tensor, u: Tensor) -> Tensor:
+    """Maps [N, C, h, w] read at `u` [N, V, P, 2] in [-1, 1] (corner pixels at the ends), [N, C, V, P]."""
+    return F.grid_sample(maps, u, mode="bilinear", padding_mode="border", align_corners=True)

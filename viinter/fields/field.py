@@ -1,0 +1,38 @@
+"""What every field offers to the training around it.
+
+Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+
+class Field(nn.Module):
+    """F(xy | z) -> rgb: `forward(xy [V, P, 2] in [-1, 1), z [V, M]) -> [V, P, 3]`, not clamped.
+
+    The other methods have defaults that do nothing; a field that wants more of the training overrides them.
+    """
+
+    def calibrate(self, codes: Tensor) -> None:
+        """Called once, before training, with the code book [n, M] as it starts."""
+
+    def parameter_groups(self, codes: nn.Parameter) -> list[dict[str, Any]]:
+        """The optimiser's groups: `params`, and `share`, their learning rate as a share of `optim.lr`."""
+        return [{"params": [*self.parameters(), codes], "share": 1.0}]
+
+    def at(self, progress: float) -> None:
+        """Called before each step with the share of the budget that is used, in [0, 1]."""
+
+    def rates(self) -> list[float]:
+        """A factor on the learning rate of each of `parameter_groups`, after `at`."""
+        return [1.0]
+
+    def finish(self, views: Tensor, codes: Tensor) -> None:
+        """Called once, after the last step, with the known views [n, H, W, 3] and their codes [n, M]."""
+
+    def penalty(self) -> Tensor | float:
+        """Added to the mean squared error of the pixels that were drawn last; called once a step."""
+        return 0.0
