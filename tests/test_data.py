@@ -27,7 +27,8 @@ def test_every_pixel_comes_with_its_own_coordinates_and_view(n, height, width, p
     assert torch.allclose(batch.xy[..., 1], -1 + 2 * row / height, atol=1e-6)
     assert batch.xy.min() >= -1
     assert batch.xy.max() < 1
-    assert batch.rgb.shape[0] * batch.rgb.shape[1] >= pixels
+    if pixels_from is not PixelsFrom.rows:  # those come in whole rows
+        assert batch.rgb.shape[0] * batch.rgb.shape[1] >= pixels
 
 
 def test_one_view_takes_all_pixels_from_one_view_and_all_views_the_same_share_from_each():
@@ -60,3 +61,18 @@ def test_views_and_pixels_are_drawn_evenly(pixels_from):
     if pixels_from is PixelsFrom.one_view:
         assert torch.allclose(share.sum((1, 2)), torch.full((4,), 0.25), atol=0.05)
     assert torch.allclose(share.sum(0), torch.full((5, 6), 1 / 30), atol=0.003)
+
+
+@given(st.integers(1, 9), st.integers(1, 30), st.integers(1, 30), st.integers(1, 2000))
+def test_rows_are_whole_in_order_and_spread_over_the_frame(n, height, width, pixels):
+    batch = PixelStore(numbered(n, height, width), pixels, PixelsFrom.rows, 0, CPU).batch(2)
+    view, row, column = batch.rgb.unbind(-1)
+    assert torch.equal(column, torch.arange(width).float().expand_as(column))
+    assert torch.equal(view, batch.view[:, None].expand_as(view).float())
+    assert (row == row[:, :1]).all()
+    assert torch.equal(row[:, 0], row[:, 0].sort().values)
+    assert len(row) == max(1, round(pixels / width))
+    assert torch.allclose(batch.xy[..., 1], -1 + 2 * row / height, atol=1e-6)
+    strata = torch.arange(len(row) + 1) * (height / len(row))  # one row from each of so many equal parts of the frame
+    assert (row[:, 0] >= strata[:-1].floor()).all()
+    assert (row[:, 0] <= strata[1:]).all()

@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "viinter"
 FLOORS = [
-    ["config", "image", "video", "codes", "features", "metrics", "fields.paper"],
+    ["config", "image", "video", "codes", "features", "metrics", "fields.field", "fields.paper", "fields.fast"],
     ["scenes"],
     ["data", "module", "views"],
     ["callbacks", "pictures"],
@@ -15,7 +15,8 @@ FLOORS = [
 ]
 # the few steps within a floor, each from the plainer to the one that uses it
 WITHIN = {
-    ("features", "config"), ("module", "data"), ("train", "command"), ("evaluate", "command"), ("render", "command"),
+    ("features", "config"), ("fields.paper", "fields.field"), ("fields.fast", "fields.field"),
+    ("module", "data"), ("train", "command"), ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),
 }  # fmt: skip
 FLOOR = {name: k for k, names in enumerate(FLOORS) for name in names}

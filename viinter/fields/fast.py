@@ -33,7 +33,7 @@ from viinter.fields.field import Field
 
 COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
 NEAREST = 4  # known views that share in a remainder
-REACH = 0.7  # how far a known view's remainder reaches, in distances between neighbouring views
+REACH = 0.7  # how far a known view's remainder reaches, in distances to the view nearest to it
 
 
 class FastField(Field):
@@ -61,7 +61,8 @@ class FastField(Field):
         shape = (views, 3, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], 4 * motion))
-        self.register_buffer("reach", torch.zeros(()))
+        self.register_buffer("reach", torch.zeros(shape[0]))
+        self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.level, self.decision = count - 1, 1.0
         self.chosen: Tensor | None = None
 
@@ -90,7 +91,7 @@ class FastField(Field):
         The finest level has 70 % of the budget, the one before 18 %, the coarser ones share the rest. The penalty is
         faded in over the finest level's first part: a decision made before the motion is known is often wrong.
         """
-        self.reach.zero_()
+        self.finished.fill_(False)
         count = len(self.levels)
         coarse = count - 2
         ends = [0.12 * (k + 1) / coarse for k in range(coarse)] + [0.30, 1.0]
@@ -129,7 +130,7 @@ class FastField(Field):
         if self.training and torch.is_grad_enabled():
             self.chosen = weight
         rgb = (weight[:, None] * read[:, :3]).sum(0).movedim(0, -1) + 0.5
-        if self.reach > 0:
+        if not self.training and self.finished:  # asked only here: on a GPU the answer must be waited for
             rgb = rgb + self.left_over(xy, place, a, b, (weight * disparity).sum(0))
         return rgb
 
@@ -146,16 +147,17 @@ class FastField(Field):
         _, height, width, _ = views.shape
         x = -1 + 2 * torch.arange(width, device=views.device) / width
         y = -1 + 2 * torch.arange(height, device=views.device) / height
-        self.reach.zero_()
+        self.finished.fill_(False)
         for k, view in enumerate(views):
             for rows in torch.arange(height, device=views.device).split(max(1, 65_536 // width)):
                 xy = torch.stack(torch.meshgrid(x, y[rows], indexing="xy"), -1).flatten(0, 1)
                 drawn = self(xy[None], codes[k : k + 1])[0].view(len(rows), width, 3)
                 self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).half()
         self.places.copy_(self.place(codes))
-        apart = torch.cdist(self.places, self.places)
-        apart.fill_diagonal_(math.inf)
-        self.reach.copy_(REACH * apart.amin(1).mean() if len(views) > 1 else torch.ones(()))
+        apart = torch.cdist(self.places, self.places).fill_diagonal_(math.inf).amin(1)
+        # two views at one place would reach nowhere
+        self.reach.copy_(REACH * apart.clamp_min(0.1 * apart.mean()) if len(views) > 1 else torch.ones(1))
+        self.finished.fill_(True)
 
     def left_over(self, xy: Tensor, place: Tensor, a: Tensor, b: Tensor, disparity: Tensor) -> Tensor:
         """The known views' remainders [V, P, 3] at pixels that move by `a`, `b` and have the mean `disparity` [V, P].

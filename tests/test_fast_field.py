@@ -1,0 +1,166 @@
+"""The fast field: motion, levels, remainders, and a small scene that moves."""
+
+import math
+
+import pytest
+import torch
+
+from viinter.codes import lerp
+from viinter.fields.fast import FastField
+from viinter.views import draw, pixel_grid
+
+M = 8
+
+
+def make(height: int = 64, width: int = 64, views: int = 2, **changes) -> FastField:
+    torch.manual_seed(0)
+    settings = {"layers": 3, "motion": 6, "margin": 1.1, "sharpness": 5.0, "entropy": 1e-3, "disparity_scale": 4,
+                "remainder": True} | changes  # fmt: skip
+    return FastField(M, views, height, width, **settings)
+
+
+def scramble(field: FastField) -> FastField:
+    with torch.no_grad():
+        for value in field.parameters():
+            value.add_(0.05 * torch.randn_like(value))
+    return field
+
+
+def test_motion_is_linear_in_the_code_so_that_a_mix_moves_half_way():
+    field = scramble(make())
+    z = torch.randn(2, M)
+    xy = pixel_grid(8, 8)[None]
+    ends = field.carry(xy.expand(2, -1, -1), field.place(z))
+    middle = field.carry(xy, field.place(z.mean(0, keepdim=True)))
+    assert torch.allclose(middle[0], ends.mean(0), atol=1e-6)
+
+
+def test_norm_and_radius_of_the_codes_do_not_matter():
+    field, z = scramble(make()), torch.randn(2, M)
+    xy = pixel_grid(8, 8).expand(2, -1, -1)
+    field.calibrate(z)
+    one = field(xy, z)
+    field.calibrate(1000 * z)
+    assert torch.allclose(field(xy, 1000 * z), one, atol=1e-5)
+
+
+@pytest.mark.parametrize(("height", "width", "levels"), [(64, 64, 2), (256, 300, 4), (32, 32, 1), (5, 7, 1), (1, 9, 1)])
+def test_the_coarsest_level_has_about_32_pixels_and_the_finest_those_of_a_view(height, width, levels):
+    field = make(height, width)
+    assert len(field.levels) == levels
+    assert field.levels[-1].shape[-2:] == (max(2, round(1.1 * height)), max(2, round(1.1 * width)))
+    assert torch.isfinite(draw(field, torch.randn(M), height, width)).all()
+
+
+@pytest.mark.parametrize("size", [32, 64, 128, 256, 1024])
+def test_levels_go_from_coarse_to_fine_and_the_finest_has_seven_tenths_of_the_budget(size):
+    field = make(size, size, views=0, layers=1)
+    seen = []
+    for k in range(1001):
+        field.at(k / 1000)
+        seen.append(field.level)
+    assert seen == sorted(seen)
+    assert set(seen) == set(range(len(field.levels)))
+    finest = seen.count(len(field.levels) - 1) / 1001
+    assert finest == pytest.approx(1.0 if size == 32 else 0.7, abs=0.01)
+
+
+def test_only_the_level_in_training_gets_a_gradient_and_whatever_moves_slows_down():
+    field = make(128, 128)
+    xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
+    for progress, level in ((0.0, 0), (0.2, 1), (0.9, 2)):
+        field.zero_grad(set_to_none=True)
+        field.at(progress)
+        (field(xy, z).square().mean() + field.penalty()).backward()
+        assert field.level == level
+        assert [k for k, texture in enumerate(field.levels) if texture.grad is not None] == [level]
+        assert field.rates()[2:] == [0.5**level] * 3
+
+
+def test_the_groups_hold_every_parameter_once_and_match_the_rates():
+    field, codes = make(), torch.nn.Parameter(torch.randn(2, M))
+    field.calibrate(codes)
+    groups = field.parameter_groups(codes)
+    held = [id(p) for group in groups for p in group["params"]]
+    assert sorted(held) == sorted(id(p) for p in [*field.parameters(), codes])
+    assert len(field.rates()) == len(groups)
+
+
+def test_the_penalty_is_greatest_undecided_and_nothing_once_each_pixel_has_one_layer():
+    field = make(entropy=1.0, layers=4)
+    xy, z = torch.rand(1, 50, 2) * 2 - 1, torch.randn(1, M)
+    field.at(1.0)
+    field(xy, z)
+    assert field.penalty().item() == pytest.approx(1 - 1 / 4, abs=1e-6)
+    with torch.no_grad():
+        field.levels[-1][2, 3] = 10.0
+    field(xy, z)
+    assert field.penalty().item() == pytest.approx(0, abs=1e-6)
+
+
+def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump():
+    field = scramble(make(40, 48, views=6))
+    codes = torch.randn(6, M)
+    views = torch.rand(6, 40, 48, 3)
+    field.calibrate(codes)
+    field.finish(views, codes)
+    field.eval()
+    for k in range(6):
+        # noise has variance 1/12; a neighbour's share of it is below a fifth at a known view
+        assert (draw(field, codes[k], 40, 48) - views[k]).square().mean() < 2 / 12 / 25
+    frames = [draw(field, lerp(codes[0], codes[1], t / 200), 40, 48) for t in range(201)]
+    steps = torch.tensor([(b - a).abs().mean() for a, b in zip(frames, frames[1:], strict=False)])  # noqa: RUF007
+    assert steps.max() < 10 * steps.mean()
+
+
+def test_training_again_leaves_the_remainder_out():
+    field = scramble(make(views=2))
+    codes, views = torch.randn(2, M), torch.rand(2, 64, 64, 3)
+    field.eval()
+    bare = draw(field, codes[0], 64, 64)
+    field.finish(views, codes)
+    assert not torch.allclose(draw(field, codes[0], 64, 64), bare, atol=1e-2)
+    field.at(1.0)
+    assert torch.allclose(draw(field, codes[0], 64, 64), bare, atol=1e-6)
+
+
+def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross_faded():
+    """Five views of a texture that moves 4 pixels from each to the next; the views half way between were never seen."""
+    size, codes = 64, torch.randn(5, M, generator=torch.Generator().manual_seed(1))
+    codes = torch.nn.Parameter(codes / codes.abs().sum(-1, keepdim=True))
+    x, y = pixel_grid(size, size).unbind(-1)
+
+    def view(t: float) -> torch.Tensor:
+        moved = x - 4 * t * 2 / size
+        waves = [torch.sin(f * math.pi * moved + k) * torch.cos(g * math.pi * y) for k, (f, g) in
+                 enumerate([(2, 3), (3, 2), (5, 4)])]  # fmt: skip
+        return (0.5 + 0.4 * torch.stack(waves, -1)).view(size, size, 3)
+
+    views = torch.stack([view(k) for k in range(5)])
+    field = make(size, size, views=5, layers=2)
+    field.calibrate(codes)
+    groups = field.parameter_groups(codes)
+    optimizer = torch.optim.Adam([{"params": g["params"], "lr": 0.02 * g["share"]} for g in groups], betas=(0.9, 0.99))
+    first = [g["lr"] for g in optimizer.param_groups]
+    rows = pixel_grid(size, size).view(size, size, 2)
+    random = torch.Generator().manual_seed(0)
+    for step in range(400):
+        field.at(step / 400)
+        for group, lr, rate in zip(optimizer.param_groups, first, field.rates(), strict=True):
+            group["lr"] = lr * rate * (0.05 + 0.95 * (1 + math.cos(math.pi * step / 400)) / 2)
+        seen = torch.randint(5, (size,), generator=random)
+        rgb = field(rows, codes[seen])
+        loss = (rgb - views[seen, torch.arange(size)]).square().mean() + field.penalty()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    field.finish(views, codes.detach())
+    field.eval()
+
+    def decibel(image: torch.Tensor, target: torch.Tensor) -> float:
+        return -10 * (image.clamp(0, 1) - target).square().mean().log10().item()
+
+    for k in range(4):
+        drawn = draw(field, lerp(codes[k], codes[k + 1], 0.5).detach(), size, size)
+        cross_fade = (views[k] + views[k + 1]) / 2
+        assert decibel(drawn, view(k + 0.5)) > decibel(cross_fade, view(k + 0.5)) + 5
