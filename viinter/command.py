@@ -56,7 +56,7 @@ def keep_freed_memory() -> None:
 def show_help(schema: Any, module: str, about: str) -> None:
     """Prints what the command does, examples, and every setting with its default and meaning."""
     console = Console(width=max(100, min(Console().width, 140)), soft_wrap=False)
-    console.print(about.strip(), markup=False)
+    console.print(about.strip(), markup=False, highlight=False, soft_wrap=True)
     if hasattr(schema, "scene"):
         for group in ("scene", "model", "scale", "experiment") if hasattr(schema, "model") else ("scene",):
             if choices(group):
@@ -127,6 +127,8 @@ def main(
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def job(cfg: DictConfig) -> None:
         try:
+            if HydraConfig.get().mode is RunMode.MULTIRUN and cfg.get("trainer", {}).get("devices", 1) not in (1, "1", "auto"):
+                raise ConfigError("trainer.devices: a job of a sweep takes one device; run several-device jobs one by one")
             function(typed(cfg, schema), Path(HydraConfig.get().runtime.output_dir))
         except UserError as error:
             if HydraConfig.get().mode is RunMode.MULTIRUN:  # the other jobs go on
