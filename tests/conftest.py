@@ -19,7 +19,7 @@ import torch
 from omegaconf import OmegaConf
 
 from viinter import config, features, image
-from viinter.config import PaperModel, TrainConfig
+from viinter.config import TrainConfig
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 REAL = REPOSITORY.parent / "shared" / "data"
@@ -112,9 +112,11 @@ SMALL = {
 
 def settings(layout: str, root: str | Path, values: dict[str, Any]) -> TrainConfig:
     """A TrainConfig as the command line makes it, tiny unless `values` ("optim.lr": 1e-2, ...) say otherwise."""
-    cfg = OmegaConf.structured(TrainConfig(model=PaperModel(name="paper")))
+    name = values.pop("model", "paper")
+    cfg = OmegaConf.structured(TrainConfig(model=config.MODELS[name](name=name)))
     scene = {"scene.name": "test", "scene.layout": layout, "scene.root": str(root)}
-    for key, value in {**scene, **SMALL, **values}.items():
+    small = {key: value for key, value in SMALL.items() if not key.startswith("model.") or key[6:] in cfg.model}
+    for key, value in {**scene, **small, **values}.items():
         OmegaConf.update(cfg, key, value)
     return config.typed(cfg, TrainConfig)
 

@@ -223,6 +223,14 @@ def test_a_sweep_makes_a_folder_a_job_and_a_job_that_fails_does_not_stop_the_oth
     assert [config.read_run(folder).codes.p for folder in (first, second)] == ["1", "2"]
 
 
+def test_a_sweep_refuses_several_devices_for_a_job(command_line, drawn, tmp_path):
+    sweep = ["-m", "scene=folder", f"scene.root={drawn('folder')}", "codes.p=1,2", "trainer.devices=2", *QUIET]
+    found = command_line("viinter.train", *sweep, cwd=tmp_path)
+    assert found.code != 0
+    assert "trainer.devices=2" in found.err
+    assert not folders(tmp_path)
+
+
 def test_a_sweep_of_good_jobs_ends_well(command_line, drawn, tmp_path):
     arguments = ["scene=pair", f"scene.root={drawn('pair')}", *QUIET]
     found = command_line("viinter.train", "-m", "codes.p=1,2", *arguments, cwd=tmp_path)

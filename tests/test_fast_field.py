@@ -164,3 +164,18 @@ def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross
         drawn = draw(field, lerp(codes[k], codes[k + 1], 0.5).detach(), size, size)
         cross_fade = (views[k] + views[k + 1]) / 2
         assert decibel(drawn, view(k + 0.5)) > decibel(cross_fade, view(k + 0.5)) + 5
+
+
+def test_mixed_precision_leaves_the_motion_as_it_is():
+    field, z, xy = scramble(make()), torch.randn(2, M), torch.rand(2, 50, 2) * 2 - 1
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = field(xy, z)
+    assert torch.equal(mixed, field(xy, z))
+
+
+def test_float32_agrees_with_float64():
+    field, z, xy = scramble(make(views=2)), torch.randn(2, M), torch.rand(2, 50, 2) * 2 - 1
+    field.finish(torch.rand(2, 64, 64, 3), z)
+    field.eval()
+    single = field(xy, z)
+    assert torch.allclose(single.double(), field.double()(xy.double(), z.double()), atol=1e-4)

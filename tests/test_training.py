@@ -114,10 +114,14 @@ def test_the_same_run_twice_gives_the_same_numbers(make_config, tmp_path):
 
 
 @pytest.mark.parametrize("tower", [{}, WITH_TOWER], ids=["pixels alone", "with the interpolation step"])
-@pytest.mark.parametrize("pixels_from", ["one_view", "all_views"])
-def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(make_config, tmp_path, fake_tower, pixels_from, tower):
+@pytest.mark.parametrize(
+    ("model", "pixels_from"), [("paper", "one_view"), ("paper", "all_views"), ("fast", "rows"), ("fast", "one_view")]
+)
+def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(
+    make_config, tmp_path, fake_tower, model, pixels_from, tower
+):
     cfg = make_config(**{
-        "optim.steps": 20, "optim.pixels_from": pixels_from, "checkpoint.every_seconds": 1e-9, **tower
+        "model": model, "optim.steps": 20, "optim.pixels_from": pixels_from, "checkpoint.every_seconds": 1e-9, **tower
     })  # fmt: skip
     straight = train(cfg, tmp_path / "straight")
     with pytest.raises(Crash):

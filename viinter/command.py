@@ -18,7 +18,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 from rich.console import Console
 from rich.table import Table
 
@@ -95,6 +95,13 @@ def check_keys(schema: type, arguments: list[str]) -> None:
                 nodes = [model() for model in MODELS.values()]
 
 
+def one_device(devices: Any) -> None:
+    """Raises ConfigError for more than one device in a job of a sweep: Lightning would start the whole sweep again for
+    each of them."""
+    if str(devices) != "1" and not (isinstance(devices, list | ListConfig) and len(devices) == 1):
+        raise ConfigError(f"trainer.devices={devices}: a job of a sweep takes one device, 1 or a list of one")
+
+
 def main(
     schema: type,
     name: str,
@@ -127,8 +134,8 @@ def main(
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def job(cfg: DictConfig) -> None:
         try:
-            if HydraConfig.get().mode is RunMode.MULTIRUN and cfg.get("trainer", {}).get("devices", 1) not in (1, "1", "auto"):
-                raise ConfigError("trainer.devices: a job of a sweep takes one device; run several-device jobs one by one")
+            if HydraConfig.get().mode is RunMode.MULTIRUN and "trainer" in cfg:
+                one_device(cfg.trainer.devices)
             function(typed(cfg, schema), Path(HydraConfig.get().runtime.output_dir))
         except UserError as error:
             if HydraConfig.get().mode is RunMode.MULTIRUN:  # the other jobs go on

@@ -333,6 +333,8 @@ def check(cfg: TrainConfig) -> None:
     if isinstance(cfg.model, FastModel):
         want(cfg.model.motion in (1, 3, 6), "model.motion", cfg.model.motion, "1, 3 or 6")
         want(cfg.model.entropy >= 0, "model.entropy", cfg.model.entropy, "0 or more")
+        want(cfg.trainer.precision not in ("16-true", "bf16-true"), "trainer.precision", cfg.trainer.precision,
+             "32-true, 64-true or a mixed one with model=fast: its motions are finer than 16 bits")  # fmt: skip
     want(cfg.interpolation.alpha >= 0, "interpolation.alpha", cfg.interpolation.alpha, "0 or more")
     want(0 < cfg.optim.lr_decay <= 1, "optim.lr_decay", cfg.optim.lr_decay, "above 0, at most 1")
     want(0 <= cfg.optim.beta2 < 1, "optim.beta2", cfg.optim.beta2, "0 or more, below 1")

@@ -117,7 +117,16 @@ class FastField(Field):
         return phi @ place.view(-1, self.motion, 4) / self.margin
 
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
-        """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped."""
+        """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped.
+
+        In mixed precision too everything is done in the precision of the parameters: a motion rounded to bfloat16
+        would be wrong by parts of a pixel, and there are no matrix products that would gain.
+        """
+        with torch.autocast(xy.device.type, enabled=False):
+            return self.draw(xy, z.to(xy.dtype))
+
+    def draw(self, xy: Tensor, z: Tensor) -> Tensor:
+        """What `forward` returns."""
         place = self.place(z)
         a, b = self.carry(xy, place).split(2, -1)
         u = (xy / self.margin + a)[None] + self.disparity[:, None, None, None] * b[None]
