@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test clean
 
 demo: $(VENV)/.run
-	$(BIN)/python -m viinter.train scale=cpu
+	$(BIN)/python -m viinter.train model=fast
 
 test: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -239,6 +239,16 @@ def test_a_sweep_of_good_jobs_ends_well(command_line, drawn, tmp_path):
     assert len(set(known)) == 2
 
 
+TABLE_1 = [("p_norm", "codes.p: none,inf,2,1.5,1"), ("code_dim", "model.code_dim: 16,32,64,128,256,512")]
+
+
+@pytest.mark.parametrize(("experiment", "swept"), TABLE_1)
+def test_an_experiment_sweeps_the_values_of_the_papers_table_on_the_lego_scene(command_line, experiment, swept):
+    chosen = ["viinter.train", f"experiment={experiment}", "--cfg"]
+    assert swept in command_line(*chosen, "all", "--package", "hydra.sweeper.params").out
+    assert "name: lego" in command_line(*chosen, "job").out
+
+
 def test_an_interrupted_run_says_how_to_go_on_and_goes_on(command_line, drawn, tmp_path):
     def interrupt(pid):
         end = time.monotonic() + 60

@@ -43,10 +43,10 @@ from viinter.scenes import Scene
 ABOUT = """
 Trains one field and one code for each image of a scene, and draws the views between them.
 
-  python -m viinter.train scale=cpu                                  the shipped scene, two minutes on two cores
-  python -m viinter.train scene=folder scene.root=DIR scale=cpu      your own photographs
+  python -m viinter.train model=fast                                 the shipped scene, two minutes on two cores
+  python -m viinter.train model=fast scene=folder scene.root=DIR     your own photographs
   python -m viinter.train scene=stanford/lego model.code_dim=64      the paper's network (a GPU and hours)
-  python -m viinter.train -m codes.p=none,inf,2,1.5,1                a sweep, one run folder for each
+  python -m viinter.train -m codes.p=none,inf,2,1.5,1 scale=cpu      a sweep, one run folder for each
   python -m viinter.train resume=RUN_DIR                             goes on with an interrupted run
   tensorboard --logdir outputs                                       watch
 """
