@@ -117,6 +117,7 @@ def train(
         step, again = trainer.global_step, f"python -m viinter.train resume={run_dir}"
         raise KeyboardInterrupt(f"interrupted at step {step}" + (f"; go on with: {again}" if step else "")) from None
 
+    module.eval()
     metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
     write_json(run_dir / "metrics.json", metrics)
     (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
