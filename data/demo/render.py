@@ -36,13 +36,14 @@ def view(name):
 
 def main():
     """Reads the command line and renders what is missing."""
-    formatter = argparse.ArgumentDefaultsHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "images", help="folder to fill")
-    parser.add_argument("--spp", type=int, default=121, help="samples a pixel")
-    parser.add_argument("--size", type=int, default=256, help="width and height in pixels")
-    parser.add_argument("--seed", type=int, default=0, help="another value gives other noise")
-    parser.add_argument("--views", type=view, nargs="+", metavar="RR_CC", help="these views, odd ones too")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "images", help="folder (%(default)s)"
+    )
+    parser.add_argument("--spp", type=int, default=121, help="samples a pixel (%(default)s)")
+    parser.add_argument("--size", type=int, default=256, help="width and height in pixels (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="another value gives other noise (%(default)s)")
+    parser.add_argument("--views", type=view, nargs="+", metavar="RR_CC", help="these only (the 81)")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     missing = [v for v in args.views or EVEN if not (args.out / file_name(*v)).exists()]
