@@ -23,7 +23,7 @@ from rich.table import Table
 
 from viinter import command
 from viinter.codes import CodeBook
-from viinter.config import PaperModel, TrainConfig
+from viinter.config import TrainConfig
 from viinter.data import PixelStore
 from viinter.module import ViewInterpolator, make_field
 from viinter.train import train
@@ -150,7 +150,7 @@ def main() -> None:
     if asked in BENCHES:
         no_folder = ["hydra.run.dir=.", "hydra.output_subdir=null"]
         sys.argv = [sys.argv[0], *PRESETS[asked], *no_folder, *sys.argv[2:]]
-    command.main(TrainConfig, "train", lambda cfg, _: BENCHES[asked](cfg), ABOUT, TrainConfig(model=PaperModel()))
+    command.main(TrainConfig, "train", lambda cfg, _: BENCHES[asked](cfg), ABOUT)
 
 
 if __name__ == "__main__":

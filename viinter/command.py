@@ -67,6 +67,11 @@ def show_help(schema: Any, module: str, about: str) -> None:
     table.add_column("meaning")
     for key, default, text in describe(schema):
         table.add_row(key, default, text)
+    if hasattr(schema, "model"):
+        for name, model in MODELS.items():
+            for key, default, text in describe(model(), "model."):
+                if key not in ("model.name", "model.code_dim"):
+                    table.add_row(key, default, f"model={name}: {text}")
     console.print("\nSettings, given as key=value:", markup=False)
     console.print(table, markup=False)
     console.print(f"\nThe composed settings of a call, without running it: python -m viinter.{module} ... --cfg job")
@@ -107,7 +112,6 @@ def main(
     name: str,
     function: Callable[[Any, Path], Any],
     about: str,
-    example: Any = None,
 ) -> None:
     """Runs `function(settings, run_dir)` with the settings of the command line.
 
@@ -116,13 +120,12 @@ def main(
         name: root configuration `conf/<name>.yaml`, and the door's name.
         function: the plain function behind the door.
         about: the text at the top of `--help`.
-        example: settings whose defaults `--help` shows; those of `schema` if None.
 
     A `UserError` ends the process with its message on standard error and exit code 1, without a traceback; so does a
     key, type or choice that Hydra refuses.
     """
     if {"--help", "-h"} & set(sys.argv[1:]):
-        show_help(example or schema(), name, about)
+        show_help(schema(), name, about)
         return
     keep_freed_memory()
     register(schema, name)

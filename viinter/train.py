@@ -35,7 +35,7 @@ from viinter.callbacks import (
     ViewLogger,
 )
 from viinter.codes import path
-from viinter.config import ConfigError, PaperModel, TrainConfig, UserError
+from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.data import SceneData
 from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
@@ -225,7 +225,7 @@ def main() -> None:
         except KeyboardInterrupt as interrupt:
             sys.exit(str(interrupt) or "interrupted")
         return
-    command.main(TrainConfig, "train", train, ABOUT, TrainConfig(model=PaperModel(name="paper")))
+    command.main(TrainConfig, "train", train, ABOUT)
 
 
 if __name__ == "__main__":

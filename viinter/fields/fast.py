@@ -123,10 +123,9 @@ class FastField(Field):
         would be wrong by parts of a pixel, and there are no matrix products that would gain.
         """
         with torch.autocast(xy.device.type, enabled=False):
-            return self.draw(xy, z.to(xy.dtype))
+            return self._colours(xy, z.to(xy.dtype))
 
-    def draw(self, xy: Tensor, z: Tensor) -> Tensor:
-        """What `forward` returns."""
+    def _colours(self, xy: Tensor, z: Tensor) -> Tensor:
         place = self.place(z)
         a, b = self.carry(xy, place).split(2, -1)
         u = (xy / self.margin + a)[None] + self.disparity[:, None, None, None] * b[None]
