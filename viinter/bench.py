@@ -17,15 +17,13 @@ from typing import Any
 
 import lightning as L
 import torch
-import torch.nn.functional as F
 from rich.console import Console
 from rich.table import Table
 
 from viinter import command
-from viinter.codes import CodeBook
 from viinter.config import TrainConfig
 from viinter.data import PixelStore
-from viinter.module import ViewInterpolator, make_field
+from viinter.module import ViewInterpolator
 from viinter.train import train
 
 ABOUT = """
@@ -56,10 +54,8 @@ class BareTwin(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         scene, cfg = trainer.datamodule.scene, self.cfg
         self.store = PixelStore(scene.views, cfg.optim.batch_pixels, cfg.optim.pixels_from, cfg.seed, module.device)
-        self.field = make_field(cfg.model, scene.n, scene.height, scene.width).to(module.device)
-        self.codes = CodeBook(scene.n, cfg.model.code_dim, module.codes.p, module.codes.radius).to(module.device)
-        weights = [*self.field.parameters(), self.codes.weight]
-        self.optimizer = torch.optim.Adam(weights, lr=cfg.optim.lr, fused=True)
+        self.twin = ViewInterpolator(cfg, scene.n, module.about).to(module.device)
+        self.optimizer = self.twin.configure_optimizers()
         for callback in trainer.callbacks:
             if callback is not self:
                 self._time(callback, "on_train_batch_start")
@@ -83,7 +79,9 @@ class BareTwin(L.Callback):
             torch.cuda.synchronize()
         return time.perf_counter()
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: ViewInterpolator, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         marks = [self._now(module.device)]
         self.framework.append(marks[0] - self.since)
 
@@ -92,14 +90,14 @@ class BareTwin(L.Callback):
 
         batch = self.store.batch(trainer.global_step)
         mark()
-        loss = F.mse_loss(self.field(batch.xy, self.codes.weight[batch.view]), batch.rgb)
+        loss = self.twin.training_step(batch, batch_idx)
         mark()
         self.optimizer.zero_grad()
         loss.backward()
         mark()
         self.optimizer.step()
         mark()
-        self.codes.project_()
+        self.twin.codes.project_()
         mark()
         self.bare.append(marks[-1] - marks[0])
         names = ("sampling", "forward", "backward", "optimiser", "code projection")

@@ -4,7 +4,7 @@ Notation: `n` known views, `M` the length of a code; "training seconds" are thos
 
 The order matters, and `train.py` keeps it: `Budget` (rate before a step, stop after), `InterpolationLoss`,
 `RenormalizeCodes` (so that the codes are on the sphere whenever a pixel step reads them), then what only looks:
-`ErrorClock`, `ViewLogger`, `Progress`, and `SaveCheckpoint` last.
+`ErrorClock`, `ViewLogger`, `ProgressBar`, and `SaveCheckpoint` last.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ class Clock:
 class Budget(L.Callback):
     """Ends the run after so many steps or training seconds, and lays the cosine schedule over whichever is given.
 
-    The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end.
+    The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end. The
+    field is told where the budget stands before each step, and finishes on the clock: see `fields.field.Field`.
     """
 
     def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
