@@ -219,8 +219,10 @@ def test_a_sweep_makes_a_folder_a_job_and_a_job_that_fails_does_not_stop_the_oth
     first, second = folders(tmp_path)
     assert (first.name, second.name) == ("0", "2")
     assert first.parent == second.parent
-    assert re.fullmatch(r"outputs/sweep/[\d_-]+", str(first.parent.relative_to(tmp_path)))
+    assert re.fullmatch(r"outputs/sweep/[\d_-]{26}", str(first.parent.relative_to(tmp_path)))
     assert [config.read_run(folder).codes.p for folder in (first, second)] == ["1", "2"]
+    reason = "ConfigError: codes.p=0.5: expected none, inf or a number >= 1\n"
+    assert {file.parent.name: file.read_text() for file in tmp_path.rglob("failure.txt")} == {"1": reason}
 
 
 def test_a_sweep_refuses_several_devices_for_a_job(command_line, drawn, tmp_path):

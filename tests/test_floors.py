@@ -7,7 +7,8 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "viinter"
 FLOORS = [
-    ["config", "image", "video", "codes", "features", "metrics", "fields.field", "fields.paper", "fields.fast"],
+    ["config", "files", "image", "video", "codes", "features", "metrics", "fields.field", "fields.paper",
+     "fields.fast"],
     ["scenes"],
     ["data", "module", "views"],
     ["callbacks", "pictures"],
@@ -15,6 +16,7 @@ FLOORS = [
 ]
 # the few steps within a floor, each from the plainer to the one that uses it
 WITHIN = {
+    ("files", "config"), ("image", "config"), ("image", "files"), ("video", "config"), ("video", "files"),
     ("features", "config"), ("fields.paper", "fields.field"), ("fields.fast", "fields.field"),
     ("module", "data"), ("train", "command"), ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),

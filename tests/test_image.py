@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from viinter import image
+from viinter.config import UserError
 
 WHITE, BLACK, GREEN = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)
 RNG = np.random.default_rng(0)
@@ -122,7 +123,7 @@ def test_write_replaces_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "a.png"
     image.write(path, torch.zeros(2, 2, 3))
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk gone")))
-    with pytest.raises(image.ImageError, match=r"a\.png.*disk gone"):
+    with pytest.raises(UserError, match=r"a\.png.*disk gone"):
         image.write(path, torch.ones(2, 2, 3))
     assert os.listdir(tmp_path) == ["a.png"]
     assert image.read(path).max() == 0
@@ -174,7 +175,7 @@ def test_write_to_impossible_places(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "a.png").mkdir()
     for path in (tmp_path / "file" / "a.png", tmp_path / "a.png"):
-        with pytest.raises(image.ImageError, match=r"a\.png.*expected a place that can be written"):
+        with pytest.raises(UserError, match=r"a\.png.*expected a place that can be written"):
             image.write(path, torch.zeros(2, 2, 3))
     assert sorted(os.listdir(tmp_path)) == ["a.png", "file"]
     with pytest.raises(image.ImageError, match="expected to write jpeg"):  # JPEG's sides end at 65535

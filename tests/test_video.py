@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from viinter import video
+from viinter.config import UserError
 
 
 def ramp(count, height, width):
@@ -170,7 +171,7 @@ def test_impossible_places(tmp_path, write):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     for path in (tmp_path / "file" / "a", tmp_path / "folder"):
-        with pytest.raises(video.VideoError, match="expected a"):
+        with pytest.raises(UserError, match="expected a"):
             write(path, ramp(2, 16, 16))
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
 

@@ -28,6 +28,7 @@ from torch.utils.tensorboard import SummaryWriter
 from viinter.codes import lerp
 from viinter.config import EvaluationConfig, InterpolationConfig, LoggingConfig, OptimConfig, plain
 from viinter.features import FeatureTower, interpolation_loss
+from viinter.files import whole
 from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
 from viinter.views import draw, measure, pixel_grid
@@ -276,12 +277,10 @@ class ErrorClock(L.Callback):
             listener(kind, index, image, target)
 
     def _write(self, board: SummaryWriter, row: dict[str, Any]) -> None:
-        part = self.file.with_suffix(".part")
-        with part.open("w", newline="") as out:
+        with whole(self.file) as part, part.open("w", newline="") as out:
             table = csv.DictWriter(out, CSV_COLUMNS)
             table.writeheader()
             table.writerows(self.rows)
-        os.replace(part, self.file)
         for key, value in row.items():
             if value is not None and key != "step":
                 group, _, what = key.partition("_")

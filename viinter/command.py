@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import os
 import platform
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from viinter.config import MODELS, REPOSITORY, ConfigError, UserError, describe, typed
+from viinter.files import failure_noted
 
 CONF = REPOSITORY / "conf"
 
@@ -122,7 +125,8 @@ def main(
         about: the text at the top of `--help`.
 
     A `UserError` ends the process with its message on standard error and exit code 1, without a traceback; so does a
-    key, type or choice that Hydra refuses.
+    key, type or choice that Hydra refuses, and an output folder that cannot be written. A run that fails leaves the
+    reason in its folder, in `failure.txt`.
     """
     if {"--help", "-h"} & set(sys.argv[1:]):
         show_help(schema(), name, about)
@@ -136,16 +140,30 @@ def main(
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def job(cfg: DictConfig) -> None:
+        hydra_cfg = HydraConfig.get()
+        run_dir = Path(hydra_cfg.runtime.output_dir)
+        alone = hydra_cfg.mode is not RunMode.MULTIRUN
         try:
-            if HydraConfig.get().mode is RunMode.MULTIRUN and "trainer" in cfg:
-                one_device(cfg.trainer.devices)
-            function(typed(cfg, schema), Path(HydraConfig.get().runtime.output_dir))
+            # of the doors only train makes a run folder
+            with failure_noted(run_dir) if hydra_cfg.output_subdir else nullcontext():
+                if not alone and "trainer" in cfg:
+                    one_device(cfg.trainer.devices)
+                function(typed(cfg, schema), run_dir)
         except UserError as error:
-            if HydraConfig.get().mode is RunMode.MULTIRUN:  # the other jobs go on
-                raise CompactHydraException(str(error)) from None
+            if not alone:  # the other jobs go on
+                raise
             sys.exit(f"{type(error).__name__}: {error}")
 
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then passes errors on instead of printing a part of their traceback
     try:
         job()
     except KeyboardInterrupt as interrupt:
         sys.exit(str(interrupt) or "interrupted")
+    except UserError as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+    except CompactHydraException as error:
+        sys.exit("\n".join(str(e) for e in (error, error.__cause__) if e))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        sys.exit(f"UserError: {error.filename}: {error.strerror}; expected a place that can be written")

@@ -7,15 +7,16 @@ change nothing. `a` is the alpha of a pixel in [0, 1]; a colour is *straight* wh
 by `a` (PNG), *associated* where it is (EXR). `name` is a path as `str`, the way messages show it.
 """
 
-import contextlib
 import os
 import stat
-import uuid
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import torch
+
+from viinter.config import UserError
+from viinter.files import whole
 
 MAX_PIXELS = 2**28
 """The most pixels that `read` and `size` accept: 16384 x 16384, 3 GiB as floats. Seen in the header."""
@@ -43,7 +44,7 @@ _ATTRIBUTES = {
 }
 
 
-class ImageError(ValueError):
+class ImageError(UserError):
     """A file that cannot be read, or an image that cannot be written or shrunk.
 
     The message names the file, what was found, and what was expected.
@@ -163,7 +164,8 @@ def write(path: str | os.PathLike, image: torch.Tensor, bits: int = 8) -> None:
     The file is written under a temporary name beside `path` and renamed, so `path` is never half an image.
 
     Raises ImageError: an unknown ending, bits that the format has not, not such an image, NaN or infinite
-    values, values too large for half floats, or a file that cannot be written.
+    values, values too large for half floats, a size that the format has not; UserError: a place that cannot be
+    written.
     """
     name, target = os.fspath(path), Path(path)
     ending = target.suffix.lower()
@@ -193,19 +195,11 @@ def write(path: str | os.PathLike, image: torch.Tensor, bits: int = 8) -> None:
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, kind)
     for key, value in _ATTRIBUTES[format_name].items():
         spec.attribute(key, value)
-    part = target.with_name(f".{uuid.uuid4().hex}{ending}")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+    with whole(target) as part:
         out = oiio.ImageOutput.create(format_name)
         written = out.open(str(part), spec) and out.write_image(pixels) and out.close()
         if not written or out.has_error:
             raise ImageError(f"{name}: {_reason(out)}; expected to write {format_name}")
-        os.replace(part, target)
-    except OSError as error:
-        raise ImageError(f"{name}: {error}; expected a place that can be written") from error
-    finally:
-        with contextlib.suppress(OSError):  # it is gone already where all went well
-            part.unlink()
 
 
 def _open(path: str | os.PathLike) -> tuple[str, oiio.ImageInput]:

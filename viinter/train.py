@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import platform
 import resource
 import sys
@@ -37,6 +36,7 @@ from viinter.callbacks import (
 from viinter.codes import path
 from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.data import SceneData
+from viinter.files import failure_noted, whole
 from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
 
@@ -204,10 +204,9 @@ def summary(metrics: dict[str, Any], run_dir: Path) -> str:
 
 
 def write_json(file: Path, values: dict[str, Any]) -> None:
-    """Writes beside, then puts in place; NaN and infinity are refused."""
-    part = file.with_suffix(".part")
-    part.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n")
-    os.replace(part, file)
+    """Writes the file whole; NaN and infinity are refused."""
+    with whole(file) as part:
+        part.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
 def main() -> None:
@@ -219,7 +218,8 @@ def main() -> None:
             cfg = config.read_run(resumed[0], others)
             if not (Path(resumed[0]) / "checkpoints" / "last.ckpt").is_file():
                 raise ConfigError(f"{resumed[0]} has no checkpoint to go on from")
-            train(cfg, Path(resumed[0]), resume=True)
+            with failure_noted(Path(resumed[0])):
+                train(cfg, Path(resumed[0]), resume=True)
         except UserError as error:
             sys.exit(f"{type(error).__name__}: {error}")
         except KeyboardInterrupt as interrupt:

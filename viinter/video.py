@@ -5,13 +5,10 @@ outside are clamped, as a field may overshoot a little. `fps` is frames a second
 one size. `name` is a path as `str`, the way messages show it.
 """
 
-import contextlib
 import itertools
 import os
-import uuid
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -19,11 +16,14 @@ import torch
 from av.video.reformatter import ColorRange, Colorspace
 from PIL import Image
 
+from viinter.config import UserError
+from viinter.files import whole
+
 _PALETTE_PIXELS = 2**19
 """About how many pixels, taken evenly from all frames, the palette of a GIF is made from."""
 
 
-class VideoError(ValueError):
+class VideoError(UserError):
     """A film that cannot be written. The message names the file, what was found, and what was expected."""
 
 
@@ -37,12 +37,12 @@ def write_mp4(path: str | os.PathLike, frames: Iterable[torch.Tensor], fps: floa
     An odd height or width becomes even by repeating the last row or column, since yuv420p halves both. The
     index stands at the front of the file (faststart). The file is written under a temporary name and renamed.
 
-    Raises VideoError: no frames, frames of different sizes, not such frames, NaN, fps out of range, or a file
-    that cannot be written. What `frames` itself raises passes through; `path` is then left as it was.
+    Raises VideoError: no frames, frames of different sizes, not such frames, NaN, fps out of range; UserError: a
+    place that cannot be written. What `frames` itself raises passes through; `path` is then left as it was.
     """
     name = os.fspath(path)
     rate = Fraction(_check_fps(name, fps, 1000)).limit_denominator(1001)
-    with _whole(name) as part:
+    with whole(name) as part:
         pictures = _pictures(name, frames)
         first = next(pictures)
         height, width, _ = first.shape
@@ -78,7 +78,7 @@ def write_gif(path: str | os.PathLike, frames: Iterable[torch.Tensor], fps: floa
     """
     name = os.fspath(path)
     _check_fps(name, fps, 50)
-    with _whole(name) as part:
+    with whole(name) as part:
         pictures = list(_pictures(name, frames))
         # A stride that is odd, so as not to fall on the same columns of every row.
         stride = max(1, sum(picture[..., 0].size for picture in pictures) // _PALETTE_PIXELS) | 1
@@ -126,22 +126,3 @@ def _pictures(name: str, frames: Iterable[torch.Tensor]) -> Iterator[np.ndarray]
         yield (frame.detach().float().clamp(0, 1) * 255).round().to("cpu", torch.uint8).contiguous().numpy()
     if shape is None:
         raise VideoError(f"{name}: no frames; expected at least one")
-
-
-@contextlib.contextmanager
-def _whole(name: str) -> Iterator[Path]:
-    """A temporary name beside `name`, whose folder is created; renamed at the end, removed on any error."""
-    target = Path(name)
-    part = target.with_name(f".{uuid.uuid4().hex}{target.suffix}")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise VideoError(f"{name}: {error}; expected a folder that can be created") from error
-    try:
-        yield part
-        try:
-            os.replace(part, target)
-        except OSError as error:
-            raise VideoError(f"{name}: {error}; expected a place that can be written") from error
-    finally:
-        part.unlink(missing_ok=True)
