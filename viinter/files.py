@@ -28,7 +28,7 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
         yield part
         os.replace(part, target)
     except OSError as error:
-        raise UserError(f"{path}: {error.strerror or error}; expected a place that can be written") from error
+        raise UserError(f"{path}: {error}; expected a place that can be written") from error
     finally:
         with suppress(OSError):  # it is gone already where all went well
             part.unlink()
