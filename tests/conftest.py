@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -140,6 +141,43 @@ def keep_config(cfg: TrainConfig, run_dir: Path) -> None:
 
 def checkpoint_of(run_dir: Path) -> dict[str, Any]:
     return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+class Crash(RuntimeError):
+    pass
+
+
+class CrashAt(L.Callback):
+    """Ends the process, as far as training can tell, after so many steps."""
+
+    def __init__(self, step, error=Crash):
+        self.step, self.error = step, error
+
+    def on_train_batch_end(self, trainer, *_):
+        if trainer.global_step == self.step:
+            raise self.error
+
+
+def same(a, b):
+    """Equal to the last bit, through dicts and lists."""
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return a == b
+
+
+def trained(run_dir):
+    """What training has made: weights, codes, and the optimiser's moments and step counts."""
+    found = checkpoint_of(run_dir)
+    return {"weights": found["state_dict"], "optimiser": found["optimizer_states"]}
+
+
+def without_times(found):
+    """Metrics but for what a second run cannot repeat."""
+    return {k: v for k, v in found.items() if "seconds" not in k and "memory" not in k}
 
 
 SERVER = """

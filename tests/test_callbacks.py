@@ -11,8 +11,9 @@ import pytest
 import torch
 from conftest import WITH_TOWER, checkpoint_of
 
-from viinter import callbacks, features
-from viinter.callbacks import Budget, Clock, ErrorClock, InterpolationLoss, RenormalizeCodes, SaveCheckpoint, ViewLogger
+from viinter import callbacks, checkpoints, features
+from viinter.callbacks import Budget, Clock, ErrorClock, InterpolationLoss, RenormalizeCodes, ViewLogger
+from viinter.checkpoints import Interruption, SaveCheckpoint
 from viinter.config import InterpolationConfig, OptimConfig, Patches
 from viinter.fields.paper import PaperField
 from viinter.module import ViewInterpolator
@@ -52,6 +53,7 @@ def stopwatch(monkeypatch):
     """Time stands still, but for a quarter of a second in each pixel step (a binary fraction: sums are exact)."""
     watch = SimpleNamespace(now=100.0, perf_counter=lambda: watch.now)
     monkeypatch.setattr(callbacks, "time", watch)
+    monkeypatch.setattr(checkpoints, "time", watch)
     step = ViewInterpolator.training_step
 
     def slow(self, *args):
@@ -245,7 +247,8 @@ def test_the_interpolation_step_comes_before_the_projection_and_both_before_what
 ):
     _, watch = interpolation_steps(make_config(**WITH_TOWER), tmp_path)
     kinds = [type(callback) for callback in watch.trainer.callbacks]
-    order = [Budget, InterpolationLoss, RenormalizeCodes, ErrorClock, ViewLogger, SaveCheckpoint, Watch]
+    order = [Budget, InterpolationLoss, RenormalizeCodes, ErrorClock, ViewLogger, Interruption, SaveCheckpoint,
+             Watch]
     assert [kind for kind in kinds if kind in order] == order
 
 
@@ -273,6 +276,7 @@ def test_with_alpha_the_interpolation_step_is_not_among_the_omitted(make_config,
 def test_a_paused_clock_stands_still(monkeypatch):
     watch = SimpleNamespace(now=0.0, perf_counter=lambda: watch.now)
     monkeypatch.setattr(callbacks, "time", watch)
+    monkeypatch.setattr(checkpoints, "time", watch)
     clock = Clock()
     watch.now = 1.0
     assert clock.seconds == 0  # not started: setting up is not training
@@ -297,6 +301,7 @@ def test_a_paused_clock_stands_still(monkeypatch):
 def test_a_clock_goes_on_from_its_state(monkeypatch):
     watch = SimpleNamespace(now=50.0, perf_counter=lambda: watch.now)
     monkeypatch.setattr(callbacks, "time", watch)
+    monkeypatch.setattr(checkpoints, "time", watch)
     clock = Clock()
     clock.load_state_dict({"training_seconds": 7.0, "wall_seconds": 9.0})
     clock.start()

@@ -251,12 +251,13 @@ def test_an_experiment_sweeps_the_values_of_the_papers_table_on_the_lego_scene(c
     assert "name: lego" in command_line(*chosen, "job").out
 
 
-def test_an_interrupted_run_says_how_to_go_on_and_goes_on(command_line, drawn, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+def test_an_interrupted_run_says_how_to_go_on_and_goes_on(command_line, drawn, tmp_path, number):
     def interrupt(pid):
         end = time.monotonic() + 60
         while not list(tmp_path.rglob("error_vs_time.csv")) and time.monotonic() < end:
             time.sleep(0.05)
-        os.kill(pid, signal.SIGINT)
+        os.kill(pid, number)
 
     arguments = ["scene=folder", f"scene.root={drawn('folder')}", *QUIET, "optim.steps=1000000"]
     found = command_line("viinter.train", *arguments, cwd=tmp_path, meanwhile=interrupt)
@@ -264,6 +265,7 @@ def test_an_interrupted_run_says_how_to_go_on_and_goes_on(command_line, drawn, t
     said = re.fullmatch(r"interrupted at step (\d+); go on with: python -m viinter.train (resume=.*)\n", found.err)
     assert said, found.err
     (file,) = tmp_path.rglob("last.ckpt")
+    assert (file.parents[1] / "failure.txt").read_text() == f"KeyboardInterrupt: {found.err}"
     steps = torch.load(file, weights_only=True)["global_step"]
     assert steps == int(said[1]) > 0
 
@@ -272,6 +274,7 @@ def test_an_interrupted_run_says_how_to_go_on_and_goes_on(command_line, drawn, t
     (run_dir,) = folders(tmp_path)
     assert run_dir == file.parents[1]
     assert json.loads((run_dir / "metrics.json").read_text())["steps"] == steps + 3
+    assert not (run_dir / "failure.txt").exists()
 
 
 def test_the_package_can_be_called_from_anywhere_and_writes_only_where_it_is_called(whole):

@@ -11,14 +11,15 @@ FLOORS = [
      "fields.fast"],
     ["scenes"],
     ["data", "module", "views"],
-    ["callbacks", "pictures"],
+    ["callbacks", "checkpoints", "pictures"],
     ["command", "train", "evaluate", "render", "download", "bench"],
 ]
 # the few steps within a floor, each from the plainer to the one that uses it
 WITHIN = {
     ("files", "config"), ("image", "config"), ("image", "files"), ("video", "config"), ("video", "files"),
     ("features", "config"), ("fields.paper", "fields.field"), ("fields.fast", "fields.field"),
-    ("module", "data"), ("train", "command"), ("evaluate", "command"), ("render", "command"),
+    ("module", "data"), ("checkpoints", "callbacks"), ("train", "command"),
+    ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),
 }  # fmt: skip
 FLOOR = {name: k for k, names in enumerate(FLOORS) for name in names}

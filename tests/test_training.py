@@ -5,53 +5,24 @@ import math
 import pickle
 from pathlib import Path
 
-import lightning as L
 import pytest
 import torch
-from conftest import REPOSITORY, WITH_TOWER, checkpoint_of, draw_folder
+from conftest import (
+    REPOSITORY,
+    WITH_TOWER,
+    Crash,
+    CrashAt,
+    checkpoint_of,
+    draw_folder,
+    same,
+    trained,
+    without_times,
+)
 
 from viinter import features, image
-from viinter.config import ConfigError, UserError, plain
+from viinter.config import UserError, plain
 from viinter.module import ViewInterpolator, load
 from viinter.train import train
-
-
-class Crash(RuntimeError):
-    pass
-
-
-class CrashAt(L.Callback):
-    """Ends the process, as far as training can tell, after so many steps."""
-
-    def __init__(self, step, error=Crash):
-        self.step, self.error = step, error
-
-    def on_train_batch_end(self, trainer, *_):
-        if trainer.global_step == self.step:
-            raise self.error
-
-
-def same(a, b):
-    """Equal to the last bit, through dicts and lists."""
-    if isinstance(a, torch.Tensor):
-        return a.dtype == b.dtype and torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return a == b
-
-
-def trained(run_dir):
-    """What training has made: weights, codes, and the optimiser's moments and step counts."""
-    found = checkpoint_of(run_dir)
-    return {"weights": found["state_dict"], "optimiser": found["optimizer_states"]}
-
-
-def without_times(found):
-    """Metrics but for what a second run cannot repeat."""
-    return {k: v for k, v in found.items() if "seconds" not in k and "memory" not in k}
-
 
 # Learning
 
@@ -247,19 +218,6 @@ def test_a_checkpoint_brings_back_the_model_that_was_trained(whole_run):
     assert plain(model.cfg) == checkpoint_of(whole_run[0])["config"]
     assert model.about["names"][0] == "view_00_00.png"
     assert (model.codes.weight.abs().sum(1) - 1).abs().max() < 1e-6
-
-
-@pytest.mark.parametrize("damage", ["absent", "empty", "cut", "foreign"])
-def test_a_checkpoint_that_cannot_be_used_is_named(whole_run, tmp_path, damage):
-    file = tmp_path / "checkpoints" / "last.ckpt"
-    file.parent.mkdir()
-    whole = (whole_run[0] / "checkpoints" / "last.ckpt").read_bytes()
-    if damage == "foreign":
-        torch.save({"weights": torch.zeros(3)}, file)
-    elif damage != "absent":
-        file.write_bytes({"empty": b"", "cut": whole[: len(whole) // 2]}[damage])
-    with pytest.raises(ConfigError, match=r"last\.ckpt"):
-        load(tmp_path)
 
 
 def test_tensorboard_has_scalars_pictures_and_hyperparameters_with_the_final_metrics(whole_run):

@@ -4,14 +4,13 @@ Notation: `n` known views, `M` the length of a code; "training seconds" are thos
 
 The order matters, and `train.py` keeps it: `Budget` (rate before a step, stop after), `InterpolationLoss`,
 `RenormalizeCodes` (so that the codes are on the sphere whenever a pixel step reads them), then what only looks:
-`ErrorClock`, `ViewLogger`, `ProgressBar`, and `SaveCheckpoint` last.
+`ErrorClock`, `ViewLogger`, `ProgressBar`, and last those of `checkpoints.py`.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -419,30 +418,3 @@ class ProgressBar(L.Callback):
 
     def on_exception(self, trainer: L.Trainer, module: ViewInterpolator, exception: BaseException) -> None:
         self.bar.stop()
-
-
-class SaveCheckpoint(L.Callback):
-    """`checkpoints/last.ckpt`, every so many wall seconds and at the end: written beside, then put in place."""
-
-    def __init__(self, every_seconds: float, clock: Clock, run_dir: Path) -> None:
-        self.every_seconds, self.clock, self.file = every_seconds, clock, run_dir / "checkpoints" / "last.ckpt"
-        self.next = time.perf_counter() + every_seconds
-
-    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        if time.perf_counter() >= self.next and not trainer.should_stop:
-            self.save(trainer)
-
-    def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
-        self.save(trainer)
-
-    def on_exception(self, trainer: L.Trainer, module: ViewInterpolator, exception: BaseException) -> None:
-        if isinstance(exception, KeyboardInterrupt) and trainer.global_step:
-            self.save(trainer)
-
-    def save(self, trainer: L.Trainer) -> None:
-        with self.clock.paused():
-            part = self.file.with_suffix(".part")
-            trainer.save_checkpoint(part)
-            if trainer.is_global_zero:
-                os.replace(part, self.file)
-            self.next = time.perf_counter() + self.every_seconds

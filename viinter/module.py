@@ -5,6 +5,7 @@ Notation: `n` known views, `M` the length of a code; rgb in [0, 1].
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -67,22 +68,61 @@ class ViewInterpolator(L.LightningModule):
         checkpoint["config"], checkpoint["about"] = plain(self.cfg), self.about
 
 
+def checkpoint_file(run: str | Path) -> Path | None:
+    """The newest checkpoint of the run folder `run`; None if there is none.
+
+    That is `checkpoints/last.ckpt`, and `previous.ckpt` if a run was killed just between renaming the one and the
+    other (`checkpoints.SaveCheckpoint`).
+    """
+    files = [Path(run) / "checkpoints" / name for name in ("last.ckpt", "previous.ckpt")]
+    return next((file for file in files if file.is_file()), None)
+
+
+def read_checkpoint(file: Path) -> dict[str, Any]:
+    """What the checkpoint `file` holds, on the CPU: plain values and tensors only (`weights_only=True`).
+
+    Raises ConfigError for a file that is damaged or none of ours, and says how to go on from the older one.
+    """
+    try:
+        found = torch.load(file, map_location="cpu", weights_only=True)
+        if isinstance(found, dict) and {"config", "about", "state_dict", "global_step"} <= set(found):
+            return found
+        reason = "another program's"
+    except pickle.UnpicklingError:  # PyTorch's own words advise to run what the file holds
+        reason = "it holds something other than plain values and tensors"
+    except (OSError, EOFError, RuntimeError, ValueError, TypeError, LookupError) as error:
+        reason = f"truncated or damaged, {error or type(error).__name__}".partition("\n")[0]
+    raise ConfigError(f"{file} is not a whole checkpoint of this version: {reason}.{_older(file)}")
+
+
+def _older(file: Path) -> str:
+    older = file.with_name("previous.ckpt")
+    if file == older or not older.is_file():
+        return " There is no older one"
+    try:
+        step = read_checkpoint(older)["global_step"]
+    except ConfigError:
+        return f" Neither is {older}"
+    return f" The one before it, of step {step}, is whole. To take it: mv {older} {file}"
+
+
 def load(run: str | Path, device: torch.device | str = "cpu") -> ViewInterpolator:
     """The trained model of the run folder `run`, in evaluation mode on `device`.
 
-    Only plain values and tensors are read from the checkpoint (`weights_only=True`). Raises ConfigError if there is no
-    checkpoint or it is not one of ours.
+    Raises ConfigError if there is no checkpoint or it is not one of ours.
     """
-    file = Path(run) / "checkpoints" / "last.ckpt"
-    if not file.is_file():
+    file = checkpoint_file(run)
+    if file is None:
+        file = Path(run) / "checkpoints" / "last.ckpt"
         raise ConfigError(f"{run} is no run folder with a checkpoint: there is no {file}")
+    checkpoint = read_checkpoint(file)
     try:
-        checkpoint = torch.load(file, map_location="cpu", weights_only=True)
-        cfg = from_plain(checkpoint["config"])
-        model = ViewInterpolator(cfg, len(checkpoint["about"]["names"]), checkpoint["about"])
+        model = ViewInterpolator(
+            from_plain(checkpoint["config"]), len(checkpoint["about"]["names"]), checkpoint["about"]
+        )
         model.load_state_dict(checkpoint["state_dict"])
-    except (KeyError, RuntimeError, EOFError, OSError, ValueError, TypeError, ImportError) as error:
-        raise ConfigError(f"{file} is not a whole checkpoint of this version: {error}") from error
+    except (LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{file} is not a checkpoint of this version: {error}") from error
     return model.to(device).eval()
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.fabric.plugins.environments import SLURMEnvironment
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from rich.console import Console
@@ -30,14 +31,14 @@ from viinter.callbacks import (
     InterpolationLoss,
     ProgressBar,
     RenormalizeCodes,
-    SaveCheckpoint,
     ViewLogger,
 )
+from viinter.checkpoints import Interruption, SaveCheckpoint
 from viinter.codes import path
 from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.data import SceneData
 from viinter.files import failure_noted, whole
-from viinter.module import ViewInterpolator
+from viinter.module import ViewInterpolator, checkpoint_file, read_checkpoint
 from viinter.scenes import Scene
 
 ABOUT = """
@@ -60,17 +61,21 @@ def train(
     Args:
         cfg: all settings.
         run_dir: where everything is written.
-        resume: go on from `run_dir/checkpoints/last.ckpt`.
+        resume: go on from the last checkpoint in `run_dir`; from the start if it was killed before the first one.
         more_callbacks: run after ours at every hook.
 
     Returns:
         What `metrics.json` holds: plain numbers, lists and strings.
 
     Raises:
-        UserError: settings, images or weights that cannot be used; nothing has been trained then.
-        KeyboardInterrupt: after Ctrl-C, when the checkpoint has been written; its message says how to go on.
+        UserError: settings, images or weights that cannot be used, and nothing has been trained then; or a full disk,
+            and the last checkpoint is whole.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, when the checkpoint has been written; its message says how to go on.
     """
     config.check(cfg)
+    again = f"python -m viinter.train resume={run_dir}"
+    if not resume and (run_dir / "checkpoints").exists():
+        raise ConfigError(f"{run_dir} holds a run already. Go on with it: {again}")
     console = Console(quiet=not cfg.logging.progress)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
@@ -84,6 +89,9 @@ def train(
     data = SceneData(scene, cfg.optim.batch_pixels, cfg.optim.pixels_from, cfg.seed)
     module = ViewInterpolator(cfg, scene.n, about(scene))
 
+    start = checkpoint_file(run_dir)
+    if start is not None:
+        check_checkpoint(start, cfg, scene)
     run_dir.mkdir(parents=True, exist_ok=True)
     clock = Clock()
     budget = Budget(cfg.optim, clock)
@@ -96,7 +104,7 @@ def train(
     if cfg.logging.progress:
         callbacks.append(ProgressBar(budget, clock, errors))
     checkpoint = SaveCheckpoint(cfg.checkpoint.every_seconds, clock, run_dir)
-    callbacks += [checkpoint, *more_callbacks]
+    callbacks += [Interruption(checkpoint.save, errors), checkpoint, *more_callbacks]
 
     try:
         trainer = L.Trainer(
@@ -108,23 +116,38 @@ def train(
             enable_progress_bar=False,
             enable_model_summary=False,
             use_distributed_sampler=False,
+            # ours saves into the run folder, and the launcher puts the job back into the queue
+            plugins=[SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else None,
         )
     except (ValueError, MisconfigurationException) as error:  # its message names the value and what is accepted
         raise ConfigError(f"trainer.*: {error}") from error
     try:
-        trainer.fit(module, data, ckpt_path=checkpoint.file if resume else None, weights_only=True)
-    except SystemExit:  # Lightning's answer to Ctrl-C
-        step, again = trainer.global_step, f"python -m viinter.train resume={run_dir}"
-        raise KeyboardInterrupt(f"interrupted at step {step}" + (f"; go on with: {again}" if step else "")) from None
-
-    module.eval()
-    metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
-    write_json(run_dir / "metrics.json", metrics)
-    (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
-    if cfg.logging.pictures:
-        show(cfg, scene, module, errors, run_dir)
+        trainer.fit(module, data, ckpt_path=start, weights_only=True)
+        module.eval()
+        metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
+        write_json(run_dir / "metrics.json", metrics)
+        (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
+        if cfg.logging.pictures:
+            show(cfg, scene, module, errors, run_dir)
+    except SystemExit as ended:
+        if not isinstance(ended.__context__, KeyboardInterrupt):  # submitit's, after it has put the job into the queue
+            raise
+        raise KeyboardInterrupt(f"interrupted at step {trainer.global_step}; go on with: {again}") from None
+    except (UserError, OSError) as error:
+        raise UserError(f"{error}; then go on with: {again}") from error
     console.print(summary(metrics, run_dir), soft_wrap=True)
     return metrics
+
+
+def check_checkpoint(file: Path, cfg: TrainConfig, scene: Scene) -> None:
+    """Raises ConfigError if the run of the checkpoint `file` had another scene or model."""
+    found = read_checkpoint(file)
+    if found["about"] != about(scene):
+        raise ConfigError(f"{cfg.scene.root} does not hold the known views that {file} was trained on")
+    for key, value in config.plain(cfg.model).items():
+        was = found["config"]["model"].get(key)
+        if value != was:
+            raise ConfigError(f"model.{key}={value}: expected {was}, with which {file} was trained")
 
 
 def interpolation_step(cfg: TrainConfig, scene: Scene, console: Console) -> InterpolationLoss:
@@ -213,11 +236,10 @@ def main() -> None:
     """The door: a new run through Hydra, or `resume=RUN_DIR` in that run's own folder."""
     resumed = [a.partition("=")[2] for a in sys.argv[1:] if a.startswith("resume=")]
     if resumed:
+        command.prepare()
         others = [a for a in sys.argv[1:] if not a.startswith("resume=")]
         try:
             cfg = config.read_run(resumed[0], others)
-            if not (Path(resumed[0]) / "checkpoints" / "last.ckpt").is_file():
-                raise ConfigError(f"{resumed[0]} has no checkpoint to go on from")
             with failure_noted(Path(resumed[0])):
                 train(cfg, Path(resumed[0]), resume=True)
         except UserError as error:
