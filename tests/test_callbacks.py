@@ -16,6 +16,7 @@ from viinter.callbacks import Budget, Clock, ErrorClock, InterpolationLoss, Reno
 from viinter.checkpoints import Interruption, SaveCheckpoint
 from viinter.config import InterpolationConfig, OptimConfig, Patches
 from viinter.fields.paper import PaperField
+from viinter.guard import DivergenceGuard
 from viinter.module import ViewInterpolator
 from viinter.train import train
 from viinter.views import draw, pixel_grid
@@ -247,8 +248,8 @@ def test_the_interpolation_step_comes_before_the_projection_and_both_before_what
 ):
     _, watch = interpolation_steps(make_config(**WITH_TOWER), tmp_path)
     kinds = [type(callback) for callback in watch.trainer.callbacks]
-    order = [Budget, InterpolationLoss, RenormalizeCodes, ErrorClock, ViewLogger, Interruption, SaveCheckpoint,
-             Watch]
+    order = [DivergenceGuard, Budget, InterpolationLoss, RenormalizeCodes, ErrorClock, ViewLogger, Interruption,
+             SaveCheckpoint, Watch]  # fmt: skip
     assert [kind for kind in kinds if kind in order] == order
 
 
@@ -333,7 +334,7 @@ def test_a_budget_of_seconds_ends_with_the_step_that_reaches_it(make_config, tmp
 
 def test_a_budget_of_real_seconds_is_kept_to_a_step(make_config, tmp_path):
     ends = []
-    watch = Watch(lambda trainer, _: ends.append(trainer.callbacks[0].clock.seconds))
+    watch = Watch(lambda trainer, _: ends.append(trainer.callbacks[1].clock.seconds))
     found = train(make_config(**{"optim.training_seconds": 0.3}), tmp_path, more_callbacks=[watch])
     longest = max(b - a for a, b in itertools.pairwise([0, *ends]))
     assert 0.3 <= found["training_seconds"] <= 0.3 + longest + 0.3  # the last for a machine that does other things

@@ -11,7 +11,7 @@ FLOORS = [
      "fields.fast"],
     ["scenes"],
     ["data", "module", "views"],
-    ["callbacks", "checkpoints", "pictures"],
+    ["callbacks", "checkpoints", "guard", "pictures"],
     ["command", "train", "evaluate", "render", "download", "bench"],
 ]
 # the few steps within a floor, each from the plainer to the one that uses it

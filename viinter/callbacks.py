@@ -2,9 +2,10 @@
 
 Notation: `n` known views, `M` the length of a code; "training seconds" are those spent in training steps alone.
 
-The order matters, and `train.py` keeps it: `Budget` (rate before a step, stop after), `InterpolationLoss`,
-`RenormalizeCodes` (so that the codes are on the sphere whenever a pixel step reads them), then what only looks:
-`ErrorClock`, `ViewLogger`, `ProgressBar`, and last those of `checkpoints.py`.
+The order matters, and `train.py` keeps it: `guard.DivergenceGuard` (before the rate is set, and before anything is
+made of the last weights), `Budget` (rate before a step, stop after), `InterpolationLoss`, `RenormalizeCodes` (so that
+the codes are on the sphere whenever a pixel step reads them), then what only looks: `ErrorClock`, `ViewLogger`,
+`ProgressBar`, and last those of `checkpoints.py`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """`python -m viinter.train`: from the files of a scene to a run folder, top to bottom.
 
 files -> `scenes.load` -> `SceneData` -> `PixelBatch` -> code -> field -> loss -> optimiser -> `InterpolationLoss` ->
-`RenormalizeCodes` -> `ErrorClock` -> `metrics.json`.
+`RenormalizeCodes` -> `ErrorClock` -> `metrics.json`. `DivergenceGuard` watches over every optimiser step.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from viinter.codes import path
 from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.data import SceneData
 from viinter.files import failure_noted, whole
+from viinter.guard import DivergenceError, DivergenceGuard
 from viinter.module import ViewInterpolator, checkpoint_file, read_checkpoint
 from viinter.scenes import Scene
 
@@ -69,7 +70,7 @@ def train(
 
     Raises:
         UserError: settings, images or weights that cannot be used, and nothing has been trained then; or a full disk,
-            and the last checkpoint is whole.
+            and the last checkpoint is whole; `DivergenceError`: the run diverged again and again.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when the checkpoint has been written; its message says how to go on.
     """
     config.check(cfg)
@@ -96,7 +97,8 @@ def train(
     clock = Clock()
     budget = Budget(cfg.optim, clock)
     errors = ErrorClock(cfg.evaluation, scene, clock, run_dir)
-    callbacks: list[L.Callback] = [budget]
+    guard = DivergenceGuard()
+    callbacks: list[L.Callback] = [guard, budget]
     if cfg.interpolation.alpha > 0:
         callbacks.append(interpolation_step(cfg, scene, console))
     callbacks += [RenormalizeCodes(), errors]
@@ -125,6 +127,7 @@ def train(
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         module.eval()
         metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
+        metrics |= {"restarts": len(guard.restarts), "restarted": guard.restarts}
         write_json(run_dir / "metrics.json", metrics)
         (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
         if cfg.logging.pictures:
@@ -133,6 +136,8 @@ def train(
         if not isinstance(ended.__context__, KeyboardInterrupt):  # submitit's, after it has put the job into the queue
             raise
         raise KeyboardInterrupt(f"interrupted at step {trainer.global_step}; go on with: {again}") from None
+    except DivergenceError:
+        raise
     except (UserError, OSError) as error:
         raise UserError(f"{error}; then go on with: {again}") from error
     console.print(summary(metrics, run_dir), soft_wrap=True)
