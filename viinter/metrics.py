@@ -14,6 +14,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 SSIM_WINDOW = 11
+STRIP_PIXELS = 2**20  # that SSIM, which needs some twenty numbers a pixel, looks at together
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,22 @@ def psnr(mse: float) -> float | None:
 def ssim(image: Tensor, target: Tensor) -> float | None:
     """Structural similarity (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, values in [0, 1].
 
-    None if a side is shorter than the window.
+    None if a side is shorter than the window. Worked out in strips of rows, so that memory does not grow with the
+    image; each has the rows beside it that its windows reach.
     """
-    if min(target.shape[:2]) < SSIM_WINDOW:
+    height, width = target.shape[:2]
+    if min(height, width) < SSIM_WINDOW:
         return None
-    pair = torch.stack([image, target]).permute(0, 3, 1, 2)
-    return structural_similarity_index_measure(pair[:1], pair[1:], data_range=1.0, kernel_size=SSIM_WINDOW).item()
+    pair, reach, total = torch.stack([image, target]).permute(0, 3, 1, 2), SSIM_WINDOW // 2, 0.0
+    for rows in torch.arange(height).split(max(1, STRIP_PIXELS // width)):
+        first, last = int(rows[0]), int(rows[-1]) + 1
+        top = max(0, first - reach)
+        strip = pair[:, :, top : last + reach]
+        _, similar = structural_similarity_index_measure(
+            strip[:1], strip[1:], data_range=1.0, kernel_size=SSIM_WINDOW, return_full_image=True
+        )
+        total += similar[:, :, first - top : last - top].mean().item() * len(rows)
+    return total / height
 
 
 def compare(image: Tensor, target: Tensor) -> ViewError:

@@ -163,8 +163,9 @@ class FastField(Field):
                 self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).half()
         self.places.copy_(self.place(codes))
         apart = torch.cdist(self.places, self.places).fill_diagonal_(math.inf).amin(1)
-        # two views at one place would reach nowhere
-        self.reach.copy_(REACH * apart.clamp_min(0.1 * apart.mean()) if len(views) > 1 else torch.ones(1))
+        # two views at one place would reach nowhere; all of them at one place still share their remainders there
+        apart = apart.clamp_min(0.1 * apart.mean()).clamp_min(1e-12)
+        self.reach.copy_(REACH * apart if len(views) > 1 else torch.ones(1))
         self.finished.fill_(True)
 
     def left_over(self, xy: Tensor, place: Tensor, a: Tensor, b: Tensor, disparity: Tensor) -> Tensor:
