@@ -25,6 +25,9 @@ from viinter.config import TrainConfig
 REPOSITORY = Path(__file__).resolve().parents[1]
 REAL = REPOSITORY.parent / "shared" / "data"
 
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY), "COLUMNS": "120"}
+"""of commands that tests type"""
+
 torch.set_num_threads(1)
 
 
@@ -229,9 +232,8 @@ def command_line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[
     imports viinter and reads its arguments as `python -m` would. What must be a process of its own uses `typed`.
     """
     folder = tmp_path_factory.mktemp("command_line")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY), "COLUMNS": "120"}
     server = subprocess.Popen(
-        [sys.executable, "-c", SERVER], cwd=folder, env=environment, text=True, stdin=subprocess.PIPE,
+        [sys.executable, "-c", SERVER], cwd=folder, env=ENVIRONMENT, text=True, stdin=subprocess.PIPE,
         stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
     )  # fmt: skip
 
@@ -255,9 +257,8 @@ def command_line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[
 
 def typed(*arguments: str, cwd: Path, timeout: float = 200) -> subprocess.CompletedProcess:
     """`python ARGUMENTS` as a process of its own, as a person types it."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY), "COLUMNS": "120"}
     return subprocess.run(
-        [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout,
+        [sys.executable, *arguments], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout,
         check=False,
     )  # fmt: skip
 

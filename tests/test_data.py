@@ -76,3 +76,21 @@ def test_rows_are_whole_in_order_and_spread_over_the_frame(n, height, width, pix
     strata = torch.arange(len(row) + 1) * (height / len(row))  # one row from each of so many equal parts of the frame
     assert (row[:, 0] >= strata[:-1].floor()).all()
     assert (row[:, 0] <= strata[1:]).all()
+
+
+@pytest.mark.parametrize("parts", [2, 3])
+@pytest.mark.parametrize(("pixels_from", "n"), [("one_view", 4), ("all_views", 4), ("all_views", 70), ("rows", 4)])
+def test_processes_that_train_together_share_the_batch_of_one(pixels_from, n, parts):
+    def batch(part, parts):
+        return PixelStore(numbered(n, 5, 6), 60, PixelsFrom(pixels_from), 0, CPU, part, parts).batch(3)
+
+    def pixels(batch):
+        view = batch.view[:, None, None].expand(-1, batch.xy.shape[1], 1)
+        return torch.cat([view.float(), batch.xy, batch.rgb], -1).flatten(0, 1)
+
+    whole, shares = pixels(batch(0, 1)), [pixels(batch(part, parts)) for part in range(parts)]
+    assert len({len(share) for share in shares}) == 1
+    both = torch.cat(shares)
+    assert len(whole) <= len(both) < len(whole) + parts * (6 if pixels_from == "rows" else n)
+    if len(both) == len(whole):
+        assert torch.equal(both.unique(dim=0), whole.unique(dim=0))

@@ -85,6 +85,11 @@ class Clock:
         self.wall_before, self.born = state["wall_seconds"], time.perf_counter()
 
 
+def agreed(trainer: L.Trainer, value: Any) -> Any:
+    """The first process's `value`: clocks differ between processes that train together, and what they do must not."""
+    return trainer.strategy.broadcast(value) if trainer.world_size > 1 else value
+
+
 class Budget(L.Callback):
     """Ends the run after so many steps or training seconds, and lays the cosine schedule over whichever is given.
 
@@ -107,17 +112,17 @@ class Budget(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         self.clock.start()
-        trainer.should_stop = self.progress(trainer) >= 1
+        trainer.should_stop = agreed(trainer, self.progress(trainer)) >= 1
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
-        progress = self.progress(trainer)
+        progress = agreed(trainer, self.progress(trainer))
         module.field.at(progress)
         factor = self.factor(progress)
         for group, rate in zip(trainer.optimizers[0].param_groups, module.field.rates(), strict=True):
             group["lr"] = group["initial_lr"] * factor * rate
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        if self.progress(trainer) >= 1:
+        if agreed(trainer, self.progress(trainer)) >= 1:
             trainer.should_stop = True
 
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
@@ -177,6 +182,10 @@ class InterpolationLoss(L.Callback):
             seen = self.tower(frame)[0]
             loss = self.cfg.alpha * interpolation_loss(seen, self.features[i], self.features[j], t)
             trainer.strategy.backward(loss, None)
+            if trainer.world_size > 1:  # all draw the same frame, but for what a GPU leaves to chance
+                for p in module.parameters():
+                    if p.grad is not None:
+                        p.grad = trainer.strategy.reduce(p.grad, reduce_op="mean")
             self.last = loss.detach()
             return loss
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import lightning as L
 
-from viinter.callbacks import Clock, ErrorClock
+from viinter.callbacks import Clock, ErrorClock, agreed
 from viinter.files import whole
 from viinter.module import ViewInterpolator
 
@@ -30,7 +30,7 @@ class SaveCheckpoint(L.Callback):
         self.next = time.perf_counter() + every_seconds
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        if time.perf_counter() >= self.next and not trainer.should_stop:
+        if agreed(trainer, time.perf_counter() >= self.next) and not trainer.should_stop:
             self.save(trainer)
 
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
@@ -59,7 +59,8 @@ class Interruption(L.Callback):
     A signal is only noted when it comes, and obeyed at the end of the step or between two views that are measured: in
     the middle of a step weights, moments and codes do not belong together. After the checkpoint the handler that was
     there before is called (submitit's puts the job back into the queue and ends the process); where there was none,
-    and after Ctrl-C, KeyboardInterrupt is raised. A second signal does not wait, and does not save.
+    and after Ctrl-C, KeyboardInterrupt is raised. A second signal does not wait, and does not save. Processes that
+    train together stop together, at the end of a step.
     """
 
     def __init__(self, save: Callable[[L.Trainer], None], errors: ErrorClock) -> None:
@@ -74,7 +75,8 @@ class Interruption(L.Callback):
         for number, handler in self.before.items():
             if handler is not signal.SIG_IGN:
                 signal.signal(number, self.note)
-        self.errors.listeners.append(lambda *_: self.obey(trainer))
+        if trainer.world_size == 1:
+            self.errors.listeners.append(lambda *_: self.obey(trainer))
 
     def note(self, number: int, frame: Any) -> None:
         if self.noted is not None:
@@ -85,11 +87,11 @@ class Interruption(L.Callback):
         self.obey(trainer)
 
     def obey(self, trainer: L.Trainer) -> None:
-        if self.noted is None:
+        if not trainer.strategy.reduce_boolean_decision(self.noted is not None, all=False):
             return
         self.save(trainer)
         number, self.noted = self.noted, None
-        handler = self.before[number]
+        handler = self.before.get(number)
         if not callable(handler):
             raise KeyboardInterrupt
         handler(number, None)

@@ -21,11 +21,11 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from viinter.config import MODELS, REPOSITORY, ConfigError, UserError, describe, typed
+from viinter.config import MODELS, REPOSITORY, ConfigError, UserError, describe, several, typed
 from viinter.files import failure_noted
 
 CONF = REPOSITORY / "conf"
@@ -109,7 +109,7 @@ def check_keys(schema: type, arguments: list[str]) -> None:
 def one_device(devices: Any) -> None:
     """Raises ConfigError for more than one device in a job of a sweep: Lightning would start the whole sweep again for
     each of them."""
-    if str(devices) != "1" and not (isinstance(devices, list | ListConfig) and len(devices) == 1):
+    if several(devices):
         raise ConfigError(f"trainer.devices={devices}: a job of a sweep takes one device, 1 or a list of one")
 
 

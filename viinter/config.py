@@ -154,7 +154,7 @@ class OptimConfig:
     lr: float = setting(1e-5, "learning rate of Adam at the start (supplement: 1e-5)")
     lr_decay: float = setting(0.1, "rate at the end, as a share of the first; cosine between (supplement: 0.1)")
     beta2: float = setting(0.999, "Adam's decay of squared gradients (PyTorch's default)")
-    batch_pixels: int = setting(8192, "pixels a step (supplement: 8192)")
+    batch_pixels: int = setting(8192, "pixels a step, of all devices together (supplement: 8192)")
     pixels_from: PixelsFrom = setting(PixelsFrom.one_view, "one random view (code), all views, or whole rows")
 
 
@@ -355,6 +355,11 @@ def check(cfg: TrainConfig) -> None:
         want(len(c) == 4 and 0 <= c[0] < c[2] and 0 <= c[1] < c[3], "scene.crop", c, "[x0,y0,x1,y1], x0<x1, y0<y1")
     if cfg.scene.endpoints is not None:
         want(len(cfg.scene.endpoints) == 2, "scene.endpoints", cfg.scene.endpoints, "two known views [i,j]")
+
+
+def several(devices: Any) -> bool:
+    """Whether `trainer.devices` may be more than one."""
+    return str(devices) != "1" and not (isinstance(devices, list | ListConfig) and len(devices) == 1)
 
 
 def typed(cfg: DictConfig, schema: type) -> Any:

@@ -34,15 +34,22 @@ class PixelStore:
     all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: whole rows, evenly
     spread over the frame and each of a random view, as many as come nearest to `pixels`; a field that reads textures
     finds what it needs of them in the cache.
+
+    Of several processes that train together, `parts`, each gets an equal share of the batch that one alone would have,
+    number `part` of them; what is spread is rounded up to a multiple of `parts`.
     """
 
-    def __init__(self, views: Tensor, pixels: int, pixels_from: PixelsFrom, seed: int, device: torch.device) -> None:
+    def __init__(
+        self, views: Tensor, pixels: int, pixels_from: PixelsFrom, seed: int, device: torch.device,
+        part: int = 0, parts: int = 1,
+    ) -> None:  # fmt: skip
         self.n, self.height, self.width, _ = views.shape
         self.rgb = views.reshape(-1, 3).to(device)
         self.pixels, self.pixels_from, self.seed = pixels, pixels_from, seed
         self.generator = torch.Generator(device)
         self.pitch = torch.tensor([2 / self.width, 2 / self.height], device=device)
         self.every_view = torch.arange(self.n, device=device)
+        self.part, self.parts = part, parts
 
     def batch(self, k: int) -> PixelBatch:
         """Batch number `k`."""
@@ -50,24 +57,33 @@ class PixelStore:
         if self.pixels_from is PixelsFrom.rows:
             return self._rows(random)
         if self.pixels_from is PixelsFrom.one_view:
-            view, share = torch.randint(self.n, (1,), generator=random, device=device), self.pixels
+            view, share = torch.randint(self.n, (1,), generator=random, device=device), self._whole(self.pixels)
         elif self.n <= self.pixels:
-            view, share = self.every_view, -(-self.pixels // self.n)
+            view, share = self.every_view, self._whole(-(-self.pixels // self.n))
         else:
-            view, share = torch.randint(self.n, (self.pixels,), generator=random, device=device), 1
+            view = torch.randint(self.n, (self._whole(self.pixels),), generator=random, device=device)
+            share = 1
         pixel = torch.randint(self.height * self.width, (len(view), share), generator=random, device=device)
+        if share > 1:
+            pixel = pixel[:, self.part :: self.parts]
+        else:
+            view, pixel = view[self.part :: self.parts], pixel[self.part :: self.parts]
         row = torch.div(pixel, self.width, rounding_mode="floor")
         xy = torch.stack([pixel - row * self.width, row], -1) * self.pitch - 1
         return PixelBatch(view, xy, self.rgb[pixel + view[:, None] * (self.height * self.width)])
 
     def _rows(self, random: torch.Generator) -> PixelBatch:
-        count, device = max(1, round(self.pixels / self.width)), self.rgb.device
+        count, device = self._whole(max(1, round(self.pixels / self.width))), self.rgb.device
         view = torch.randint(self.n, (count,), generator=random, device=device)
         spread = torch.arange(count, device=device) + torch.rand(count, generator=random, device=device)
         row = (spread * (self.height / count)).long().clamp_(max=self.height - 1)
-        column = torch.arange(self.width, device=device).expand(count, -1)
+        view, row = view[self.part :: self.parts], row[self.part :: self.parts]
+        column = torch.arange(self.width, device=device).expand(len(row), -1)
         xy = torch.stack([column, row[:, None].expand(-1, self.width)], -1) * self.pitch - 1
         return PixelBatch(view, xy, self.rgb.view(-1, self.width, 3)[view * self.height + row])
+
+    def _whole(self, count: int) -> int:
+        return -(-count // self.parts) * self.parts
 
 
 class _Numbers:
@@ -101,9 +117,10 @@ class SceneData(L.LightningDataModule):
 
     def train_dataloader(self) -> _Numbers:
         device = self.trainer.strategy.root_device
-        # every process of a distributed run draws pixels of its own
-        seed = self.seed + 1_000_003 * self.trainer.global_rank
-        self.store = PixelStore(self.scene.views, self.batch_pixels, self.pixels_from, seed, device)
+        self.store = PixelStore(
+            self.scene.views, self.batch_pixels, self.pixels_from, self.seed, device,
+            self.trainer.global_rank, self.trainer.world_size,
+        )  # fmt: skip
         return _Numbers(self.trainer)
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> PixelBatch:

@@ -20,6 +20,7 @@ import lightning as L
 import torch
 from lightning.fabric.plugins.environments import SLURMEnvironment
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from rich.console import Console
 
@@ -66,7 +67,7 @@ def train(
         more_callbacks: run after ours at every hook.
 
     Returns:
-        What `metrics.json` holds: plain numbers, lists and strings.
+        What `metrics.json` holds: plain numbers, lists and strings. Of several processes the first alone has it.
 
     Raises:
         UserError: settings, images or weights that cannot be used, and nothing has been trained then; or a full disk,
@@ -77,10 +78,11 @@ def train(
     again = f"python -m viinter.train resume={run_dir}"
     if not resume and (run_dir / "checkpoints").exists():
         raise ConfigError(f"{run_dir} holds a run already. Go on with it: {again}")
-    console = Console(quiet=not cfg.logging.progress)
+    console = Console(quiet=not cfg.logging.progress or rank_zero_only.rank != 0)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     # Lightning 2.6 asks torch 2.14's pytree in the old way
     warnings.filterwarnings("ignore", "`isinstance.treespec, LeafSpec.`", FutureWarning)
     L.seed_everything(cfg.seed, verbose=False)
@@ -101,16 +103,18 @@ def train(
     callbacks: list[L.Callback] = [guard, budget]
     if cfg.interpolation.alpha > 0:
         callbacks.append(interpolation_step(cfg, scene, console))
-    callbacks += [RenormalizeCodes(), errors]
-    callbacks.append(ViewLogger(cfg.logging, scene, clock, errors, cfg.evaluation.chunk_pixels))
-    if cfg.logging.progress:
-        callbacks.append(ProgressBar(budget, clock, errors))
+    callbacks.append(RenormalizeCodes())
+    first = rank_zero_only.rank == 0  # of the processes that train together it alone looks and writes
+    if first:
+        callbacks += [errors, ViewLogger(cfg.logging, scene, clock, errors, cfg.evaluation.chunk_pixels)]
+        if cfg.logging.progress:
+            callbacks.append(ProgressBar(budget, clock, errors))
     checkpoint = SaveCheckpoint(cfg.checkpoint.every_seconds, clock, run_dir)
     callbacks += [Interruption(checkpoint.save, errors), checkpoint, *more_callbacks]
 
     try:
         trainer = L.Trainer(
-            **config.plain(cfg.trainer),
+            **{**config.plain(cfg.trainer), "strategy": strategy(cfg)},
             max_epochs=-1,
             logger=TensorBoardLogger(run_dir, name="", version="", default_hp_metric=False),
             callbacks=callbacks,
@@ -125,6 +129,8 @@ def train(
         raise ConfigError(f"trainer.*: {error}") from error
     try:
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
+        if not first:
+            return {}
         module.eval()
         metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
         metrics |= {"restarts": len(guard.restarts), "restarted": guard.restarts}
@@ -142,6 +148,13 @@ def train(
         raise UserError(f"{error}; then go on with: {again}") from error
     console.print(summary(metrics, run_dir), soft_wrap=True)
     return metrics
+
+
+def strategy(cfg: TrainConfig) -> str:
+    """How several devices train together; of the fast field's textures only some are in training at a time."""
+    if cfg.model.name == "fast" and cfg.trainer.strategy == "auto" and config.several(cfg.trainer.devices):
+        return "ddp_find_unused_parameters_true"
+    return cfg.trainer.strategy
 
 
 def check_checkpoint(file: Path, cfg: TrainConfig, scene: Scene) -> None:
