@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from viinter.codes import CodeBook, ease, lerp, mix, p_norm, path, project
+from viinter.codes import CodeBook, ease, lerp, mix, p_norm, path, project, radius_of_length
 
 orders = st.one_of(st.just(math.inf), st.just(1.0), st.floats(1, 100))
 scales = st.floats(-30, 30).map(lambda e: 10.0**e)
@@ -98,3 +98,28 @@ def test_easing_starts_and_ends_at_rest():
     assert eased[[0, 2, 4]].tolist() == [0, 0.5, 1]
     assert eased[1] < 1e-5
     assert 1 - eased[3] < 1e-5
+
+
+@pytest.mark.parametrize("p", [1.0, 1.5, 2.0, 20.0, math.inf])
+@pytest.mark.parametrize("m", [16, 128, 512])
+def test_codes_on_the_sphere_of_a_length_are_about_that_long(p, m):
+    torch.manual_seed(1)
+    book = CodeBook(50, m, p, radius=7.0, length=0.3)
+    book.project_()
+    assert book.radius == radius_of_length(0.3, p, m)
+    assert torch.allclose(book.norms(), torch.full((50,), book.radius))
+    assert book.weight.detach().norm(dim=1).mean() == pytest.approx(0.3, rel=0.05)
+
+
+def test_the_published_radius_gives_each_p_another_length():
+    lengths = {p: 1 / radius_of_length(1.0, p, 128) for p in (1.0, 1.5, 2.0, math.inf)}
+    assert lengths == pytest.approx({1.0: 0.11, 1.5: 0.49, 2.0: 1.0, math.inf: 4.0}, rel=0.05)
+
+
+def test_free_codes_start_at_the_length_and_are_not_held_there():
+    book = CodeBook(200, 128, None, radius=1.0, length=2.5)
+    before = book.weight.detach().clone()
+    assert before.norm(dim=1).mean() == pytest.approx(2.5, rel=0.05)
+    assert before.norm(dim=1).std() > 0
+    book.project_()
+    assert torch.equal(book.weight, before)

@@ -11,8 +11,8 @@ FLOORS = [
      "fields.fast"],
     ["scenes"],
     ["data", "module", "views"],
-    ["callbacks", "checkpoints", "guard", "pictures"],
-    ["command", "train", "evaluate", "render", "download", "bench"],
+    ["callbacks", "checkpoints", "guard", "pictures", "page", "runs", "comparisons", "plots"],
+    ["command", "train", "evaluate", "render", "download", "bench", "report"],
 ]
 # the few steps within a floor, each from the plainer to the one that uses it
 WITHIN = {
@@ -21,6 +21,7 @@ WITHIN = {
     ("module", "data"), ("checkpoints", "callbacks"), ("train", "command"),
     ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),
+    ("comparisons", "page"), ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
 }  # fmt: skip
 FLOOR = {name: k for k, names in enumerate(FLOORS) for name in names}
 

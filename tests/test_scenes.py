@@ -567,6 +567,15 @@ def test_a_factor_larger_than_the_view(tmp_path, factor):
         load(config(draw(tmp_path, ["a.png", "b.png"]), downsample=factor))
 
 
+@pytest.mark.parametrize(
+    ("downsample", "most", "size"),
+    [(1, 24, (4, 6)), (1, 23, (2, 3)), (2, 24, (2, 3)), (1, 5, (1, 2)), (1, 1, (1, 1)), (1, None, (4, 6))],
+)
+def test_most_pixels_are_kept_to_by_a_whole_factor(tmp_path, downsample, most, size):
+    scene = load(config(draw(tmp_path, ["a.png", "b.png"]), downsample=downsample, max_pixels=most))
+    assert (scene.height, scene.width) == size
+
+
 @pytest.mark.parametrize("endpoints", [[0, 3], [-1, 1], [1, 1], [1]])
 def test_endpoints_are_known_views(tmp_path, endpoints):
     draw(tmp_path, ["a.png", "b.png", "c.png"])

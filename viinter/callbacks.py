@@ -26,7 +26,7 @@ from torch.utils.checkpoint import checkpoint
 from torch.utils.tensorboard import SummaryWriter
 
 from viinter.codes import lerp
-from viinter.config import EvaluationConfig, InterpolationConfig, LoggingConfig, OptimConfig, plain
+from viinter.config import EvaluationConfig, InterpolationConfig, LoggingConfig, OptimConfig, flat, plain
 from viinter.features import FeatureTower, interpolation_loss
 from viinter.files import whole
 from viinter.module import ViewInterpolator
@@ -345,7 +345,7 @@ class ViewLogger(L.Callback):
             f"final/{kind}_{key}": self.errors.final[kind][key]
             for kind in ("known", "novel") for key in ("psnr", "ssim") if self.errors.final[kind][key] is not None
         }  # fmt: skip
-        trainer.logger.log_hyperparams(_flat(plain(module.cfg)), final)
+        trainer.logger.log_hyperparams({k: _shown(v) for k, v in flat(plain(module.cfg)).items()}, final)
 
     def _scalars(self, trainer: L.Trainer, module: ViewInterpolator, loss: float) -> None:
         board, step = trainer.logger.experiment, trainer.global_step
@@ -378,12 +378,9 @@ class ViewLogger(L.Callback):
         board.flush()
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as one level, `optim.lr`, for TensorBoard's HPARAMS tab."""
-    found = {}
-    for key, value in values.items():
-        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in found.items()}
+def _shown(value: Any) -> bool | int | float | str:
+    """A value as TensorBoard's HPARAMS tab takes it."""
+    return value if isinstance(value, bool | int | float | str) else str(value)
 
 
 class ProgressBar(L.Callback):

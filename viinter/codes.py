@@ -72,17 +72,37 @@ def path(codes: Tensor, views: list[int], frames: int, smooth: bool = False, loo
     return torch.cat(legs if loop else [*legs, codes[stops[-1]][None]])
 
 
+def radius_of_length(length: float, p: float, code_dim: int) -> float:
+    """The mean p-norm of normal random codes of `code_dim` entries, scaled to the Euclidean `length`.
+
+    The published radius 1 means another Euclidean length for each p (at M = 128: 0.11 for p = 1, 1 for p = 2, 4 for
+    p = inf). Codes on the p-norm sphere of this radius have Euclidean lengths around `length`, the same for all p.
+    """
+    z = torch.randn(1024, code_dim, generator=torch.Generator().manual_seed(0))
+    return p_norm(project(z, 2.0, length), p).mean().item()
+
+
 class CodeBook(nn.Module):
     """The codes of a scene's known views, `weight` [n, M], drawn from a standard normal (supplement: PyTorch default).
 
     `project_` puts them on the sphere in place; a code with all entries below 1e-6 is replaced by one drawn at the
     start, and `redrawn` (a tensor, so that counting needs no synchronisation) counts how often that happened.
+
+    Args:
+        views, code_dim: n and M.
+        p, radius: the norm, and the value that it is kept at.
+        length: in place of `radius`, see `radius_of_length`; without a norm, the codes' mean Euclidean length as drawn.
     """
 
-    def __init__(self, views: int, code_dim: int, p: float | None, radius: float) -> None:
+    def __init__(self, views: int, code_dim: int, p: float | None, radius: float, length: float | None = None) -> None:
         super().__init__()
+        drawn = torch.randn(views, code_dim)
+        if length is not None and p is None:
+            drawn *= length / math.sqrt(code_dim)
+        elif length is not None:
+            radius = radius_of_length(length, p, code_dim)
         self.p, self.radius = p, radius
-        self.weight = nn.Parameter(torch.randn(views, code_dim))
+        self.weight = nn.Parameter(drawn)
         self.register_buffer("spare", torch.randn(views, code_dim))
         self.register_buffer("redrawn", torch.zeros((), dtype=torch.long))
 

@@ -64,7 +64,7 @@ def show_help(schema: Any, module: str, about: str) -> None:
     console = Console(width=max(100, min(Console().width, 140)), soft_wrap=False)
     console.print(about.strip(), markup=False, highlight=False, soft_wrap=True)
     if hasattr(schema, "scene"):
-        for group in ("scene", "model", "scale", "experiment") if hasattr(schema, "model") else ("scene",):
+        for group in ("scene", "model", "scale", "tower", "experiment") if hasattr(schema, "model") else ("scene",):
             if choices(group):
                 console.print(f"\n{group}= one of: {', '.join(choices(group))}", markup=False, highlight=False)
     table = Table(box=None, header_style="bold", padding=(0, 1))

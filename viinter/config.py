@@ -96,6 +96,9 @@ class SceneConfig:
     root: str = setting(MISSING, "folder of the scene's images (llff, studio: of the scene)")
     images: str | None = setting(None, "llff: the sub-folder with the images, such as images_4")
     downsample: int = setting(1, "area reduction by this whole factor, before cropping")
+    max_pixels: int | None = setting(
+        None, "most pixels of a view: reduce by the smallest whole factor, from downsample on, that brings it there"
+    )
     crop: list[int] | None = setting(None, "[x0,y0,x1,y1] in pixels after downsampling, x1 and y1 excluded")
     holdout: Holdout = setting(Holdout.standard, "standard: the layout's probes are held out; none: train on all")
     max_views: int = setting(30, "most views trained on with holdout=none (30 in the paper)")
@@ -113,6 +116,9 @@ class SceneConfig:
 class CodesConfig:
     p: str = setting("1", "norm that codes are kept at: none, inf, or a number >= 1 (paper Section 3.3: 1)")
     radius: float = setting(1.0, "that norm's value (paper Section 3.3: 1)")
+    length: float | None = setting(
+        None, "ours, in place of radius: the norm of a random code of this Euclidean length; p=none: codes start at it"
+    )
 
 
 @dataclass
@@ -341,6 +347,8 @@ def check(cfg: TrainConfig) -> None:
     want(cfg.evaluation.factor > 1, "evaluation.factor", cfg.evaluation.factor, "above 1")
     want(cfg.evaluation.max_share >= 0, "evaluation.max_share", cfg.evaluation.max_share, "0 or more")
     want(cfg.logging.frames >= 2, "logging.frames", cfg.logging.frames, "2 or more")
+    for key, value in {"scene.max_pixels": cfg.scene.max_pixels, "codes.length": cfg.codes.length}.items():
+        want(value is None or (value > 0 and math.isfinite(value)), key, value, "a number above 0, or null")
     want(cfg.threads is None or cfg.threads > 0, "threads", cfg.threads, "a number above 0, or null")
     if cfg.optim.training_seconds is None:
         want(cfg.optim.steps > 0, "optim.steps", cfg.optim.steps, "a number above 0")
@@ -386,6 +394,14 @@ def plain(cfg: Any) -> dict[str, Any]:
         return value
 
     return simple(cfg)
+
+
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested plain settings as one level: {"optim.lr": 1e-5, ...}."""
+    found = {}
+    for key, value in values.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found
 
 
 def from_plain(values: dict[str, Any] | DictConfig, overrides: list[str] = ()) -> TrainConfig:

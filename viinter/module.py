@@ -46,7 +46,7 @@ class ViewInterpolator(L.LightningModule):
         super().__init__()
         self.cfg, self.about = cfg, about
         self.field = make_field(cfg.model, n, about["height"], about["width"])
-        self.codes = CodeBook(n, cfg.model.code_dim, norm_order(cfg.codes.p), cfg.codes.radius)
+        self.codes = CodeBook(n, cfg.model.code_dim, norm_order(cfg.codes.p), cfg.codes.radius, cfg.codes.length)
         self.codes.project_()
         self.field.calibrate(self.codes.weight)
 

@@ -120,7 +120,7 @@ class Plan:
 def load(cfg: SceneConfig) -> Scene:
     """Loads the scene that `cfg` describes: list -> known and probes -> sizes -> read -> range -> `Scene`.
 
-    Only the files that are known views or probes are opened. They are reduced by `cfg.downsample`, then
+    Only the files that are known views or probes are opened. They are reduced by `_factor`, then
     cropped to `cfg.crop` (else to the masks' box, if there are masks). What is asked of the values
     (`cfg.out_of_range`) is asked of the views so obtained.
 
@@ -140,13 +140,14 @@ def load(cfg: SceneConfig) -> Scene:
     # OpenImageIO lets go of Python's lock while it decodes. More threads would hold more full images at once.
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         size = _common_size(files, _map(pool, image.size, files))
-        crop = _crop(cfg, plan, size, pool, notes)
+        factor = _factor(cfg, size)
+        crop = _crop(cfg, factor, plan, size, pool, notes)
         background = tuple(cfg.background)
 
         def view(file: Path) -> Tensor:
             x0, y0, x1, y1 = crop
             pixels = image.read(file, background)
-            return image.downsample(pixels, cfg.downsample)[y0:y1, x0:x1].contiguous()
+            return image.downsample(pixels, factor)[y0:y1, x0:x1].contiguous()
 
         views = _map(pool, view, files)
 
@@ -461,14 +462,21 @@ def _common_size(files: list[Path], sizes: list[tuple[int, int]]) -> tuple[int, 
     return sizes[0]
 
 
-def _crop(
-    cfg: SceneConfig, plan: Plan, size: tuple[int, int], pool: ThreadPoolExecutor, notes: list[str]
-) -> tuple[int, int, int, int]:
-    """(x0, y0, x1, y1), the part of the downsampled views to keep; `size` is theirs before downsampling."""
+def _factor(cfg: SceneConfig, size: tuple[int, int]) -> int:
+    """The whole factor by which views of `size` are reduced: `cfg.downsample`, more to keep to `cfg.max_pixels`."""
     factor = cfg.downsample
     if not 1 <= factor <= min(size):
         pixels = f"{size[1]} x {size[0]} pixels"
         raise SceneError(f"scene.downsample={factor}: expected 1 to {min(size)}; views are {pixels}")
+    while cfg.max_pixels and (size[0] // factor) * (size[1] // factor) > cfg.max_pixels and factor < min(size):
+        factor += 1
+    return factor
+
+
+def _crop(
+    cfg: SceneConfig, factor: int, plan: Plan, size: tuple[int, int], pool: ThreadPoolExecutor, notes: list[str]
+) -> tuple[int, int, int, int]:
+    """(x0, y0, x1, y1), the part to keep of views that are reduced by `factor`; `size` is theirs before that."""
     height, width = size[0] // factor, size[1] // factor
     if cfg.crop is not None:
         x0, y0, x1, y1 = cfg.crop if len(cfg.crop) == 4 else (0, 0, 0, 0)

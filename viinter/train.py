@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import platform
 import resource
 import sys
@@ -22,6 +23,7 @@ from lightning.fabric.plugins.environments import SLURMEnvironment
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from omegaconf import OmegaConf
 from rich.console import Console
 
 from viinter import command, config, features, pictures, scenes
@@ -50,7 +52,7 @@ Trains one field and one code for each image of a scene, and draws the views bet
   python -m viinter.train model=fast scene=folder scene.root=DIR     your own photographs
   python -m viinter.train scene=stanford/lego model.code_dim=64      the paper's network (a GPU and hours)
   python -m viinter.train -m codes.p=none,inf,2,1.5,1 scale=cpu      a sweep, one run folder for each
-  python -m viinter.train resume=RUN_DIR                             goes on with an interrupted run
+  python -m viinter.train resume=RUN_DIR                             goes on with an interrupted run, or sweep
   tensorboard --logdir outputs                                       watch
 """
 
@@ -168,6 +170,35 @@ def check_checkpoint(file: Path, cfg: TrainConfig, scene: Scene) -> None:
             raise ConfigError(f"model.{key}={value}: expected {was}, with which {file} was trained")
 
 
+def train_or_go_on(cfg: TrainConfig, run_dir: Path) -> dict[str, Any]:
+    """`train`, in a folder that may hold this very run already, as a job of a sweep that is started again has.
+
+    A finished run stays as it is and its metrics are returned; one with a checkpoint goes on from there.
+
+    Raises:
+        UserError: as `train`, and if the folder holds a run with other settings.
+    """
+    done, begun = run_dir / "metrics.json", checkpoint_file(run_dir)
+    if done.is_file():
+        metrics = json.loads(done.read_text())
+        same_settings(cfg, metrics.get("settings", {}), run_dir)
+        return metrics
+    if begun:
+        same_settings(cfg, read_checkpoint(begun)["config"], run_dir)
+    return train(cfg, run_dir, resume=(run_dir / "checkpoints").exists())
+
+
+def same_settings(cfg: TrainConfig, kept: dict[str, Any], run_dir: Path) -> None:
+    """Raises ConfigError, naming a key, if the run in `run_dir`, whose plain settings are `kept`, is another one."""
+    mine, theirs = (config.flat(json.loads(json.dumps(values))) for values in (config.plain(cfg), kept))
+    if other := [key for key in {**mine, **theirs} if mine.get(key) != theirs.get(key)]:
+        key = other[0]
+        raise ConfigError(
+            f"{run_dir} holds a run with {key}={theirs.get(key)}, not {mine.get(key)}; give hydra.sweep.dir=DIR, a "
+            "folder of its own"
+        )
+
+
 def interpolation_step(cfg: TrainConfig, scene: Scene, console: Console) -> InterpolationLoss:
     """Loads the feature tower and extracts the known views' features, once (supplement, Algorithm 1, "Prepare")."""
     tower = features.load(cfg.features, torch.device("cpu"))
@@ -210,14 +241,28 @@ def facts(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, trainer: L.T
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
     found = {
         "training_seconds": clock.seconds, "wall_seconds": clock.wall_seconds, "steps": trainer.global_step,
-        "peak_memory_mb": peak, "codes_redrawn": int(module.codes.redrawn), "probes_left_out": scene.left_out,
+        "peak_memory_mb": peak, "codes_redrawn": int(module.codes.redrawn),
+        "code_length": module.codes.weight.detach().norm(dim=1).mean().item(), "probes_left_out": scene.left_out,
         "omitted": omitted(cfg, scene), "scene": scene.name, "model": cfg.model.name, "seed": cfg.seed,
         "threads": torch.get_num_threads(), "device": str(module.device), "precision": cfg.trainer.precision,
         "versions": {"python": platform.python_version(), "torch": torch.__version__, "lightning": L.__version__},
+        "hardware": hardware(module.device), "views": scene.n, "height": scene.height, "width": scene.width,
+        "settings": config.plain(cfg),
     }  # fmt: skip
     if module.device.type == "cuda":
         found["peak_device_memory_mb"] = torch.cuda.max_memory_allocated() / 2**20
     return found
+
+
+def hardware(device: torch.device) -> str:
+    """The processor that trained, by name."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    name = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").is_file():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    return f"{name}, {os.cpu_count()} logical processors"
 
 
 def show(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, errors: ErrorClock, run_dir: Path) -> None:
@@ -251,9 +296,14 @@ def write_json(file: Path, values: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """The door: a new run through Hydra, or `resume=RUN_DIR` in that run's own folder."""
+    """The door: a new run or sweep through Hydra, or `resume=DIR` in the folder of an interrupted one."""
     resumed = [a.partition("=")[2] for a in sys.argv[1:] if a.startswith("resume=")]
-    if resumed:
+    if resumed and (sweep := Path(resumed[0]) / "multirun.yaml").is_file():
+        typed = OmegaConf.load(sweep).hydra.overrides
+        own = [o for o in [*typed.hydra, *typed.task] if not o.startswith(("hydra.mode=", "hydra.sweep.dir="))]
+        others = [a for a in sys.argv[1:] if not a.startswith("resume=")]
+        sys.argv[1:] = ["-m", *own, f"hydra.sweep.dir={resumed[0]}", *others]
+    elif resumed:
         command.prepare()
         others = [a for a in sys.argv[1:] if not a.startswith("resume=")]
         try:
@@ -265,7 +315,7 @@ def main() -> None:
         except KeyboardInterrupt as interrupt:
             sys.exit(str(interrupt) or "interrupted")
         return
-    command.main(TrainConfig, "train", train, ABOUT)
+    command.main(TrainConfig, "train", train_or_go_on, ABOUT)
 
 
 if __name__ == "__main__":
