@@ -11,8 +11,8 @@ FLOORS = [
      "fields.fast"],
     ["scenes"],
     ["data", "module", "views"],
-    ["callbacks", "checkpoints", "guard", "pictures", "page", "runs", "comparisons", "plots"],
-    ["command", "train", "evaluate", "render", "download", "bench", "report"],
+    ["callbacks", "checkpoints", "guard", "pictures", "page", "runs", "comparisons", "plots", "twin"],
+    ["command", "train", "evaluate", "render", "download", "bench", "report", "stability"],
 ]
 # the few steps within a floor, each from the plainer to the one that uses it
 WITHIN = {
@@ -22,6 +22,7 @@ WITHIN = {
     ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),
     ("comparisons", "page"), ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
+    ("stability", "command"), ("stability", "train"),
 }  # fmt: skip
 FLOOR = {name: k for k, names in enumerate(FLOORS) for name in names}
 

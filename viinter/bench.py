@@ -142,7 +142,9 @@ PRESETS = {"step": ["model.width=128", "model.depth=5", "optim.steps=210", "logg
 
 def main() -> None:
     """`python -m viinter.bench WHAT key=value ...`."""
-    asked = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if len(sys.argv) == 1:
+        sys.argv.append("--help")
+    asked = sys.argv[1]
     if asked not in BENCHES and asked not in ("--help", "-h"):
         sys.exit(f"{asked}: there is no such bench. There are: {', '.join(BENCHES)}")
     if asked in BENCHES:
