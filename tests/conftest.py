@@ -222,16 +222,9 @@ for line in sys.stdin:
 """
 
 
-@pytest.fixture(scope="session")
-def command_line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., SimpleNamespace]]:
-    """`command_line("viinter.train", "scene=demo", ..., cwd=DIR)`: code, out, err and seconds of that command.
-
-    `meanwhile` is called with its process number while it runs.
-
-    Importing PyTorch and Lightning takes seconds. One process does so once and forks for each command, which then
-    imports viinter and reads its arguments as `python -m` would. What must be a process of its own uses `typed`.
-    """
-    folder = tmp_path_factory.mktemp("command_line")
+@contextlib.contextmanager
+def commands(folder: Path) -> Iterator[Callable[..., SimpleNamespace]]:
+    """What the fixture `command_line` gives; commands run in `folder` unless they say otherwise."""
     server = subprocess.Popen(
         [sys.executable, "-c", SERVER], cwd=folder, env=ENVIRONMENT, text=True, stdin=subprocess.PIPE,
         stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
@@ -253,6 +246,19 @@ def command_line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[
     with contextlib.suppress(ProcessLookupError):
         os.killpg(server.pid, signal.SIGKILL)  # the server, and a command that a failed test has left
     server.communicate()
+
+
+@pytest.fixture(scope="session")
+def command_line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., SimpleNamespace]]:
+    """`command_line("viinter.train", "scene=demo", ..., cwd=DIR)`: code, out, err and seconds of that command.
+
+    `meanwhile` is called with its process number while it runs.
+
+    Importing PyTorch and Lightning takes seconds. One process does so once and forks for each command, which then
+    imports viinter and reads its arguments as `python -m` would. What must be a process of its own uses `typed`.
+    """
+    with commands(tmp_path_factory.mktemp("command_line")) as run:
+        yield run
 
 
 def typed(*arguments: str, cwd: Path, timeout: float = 200) -> subprocess.CompletedProcess:

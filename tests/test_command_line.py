@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import REPOSITORY, draw_folder, typed, without_times
+from conftest import REPOSITORY, typed, without_times
 
 from viinter import config, image
 
@@ -48,87 +48,6 @@ def test_help_of_train_knows_the_field_and_its_defaults(command_line):
     out = command_line("viinter.train", "-h").out
     for row in (r"model\.width +512", r"model\.depth +8", r"codes\.p +1 ", r"optim\.batch_pixels +8192"):
         assert re.search(row, out)
-
-
-# Refusals
-
-
-@pytest.fixture(scope="module")
-def odd(tmp_path_factory):
-    """Folders that cannot be trained on."""
-    root = tmp_path_factory.mktemp("odd")
-    draw_folder(root / "sizes", 2)
-    image.write(root / "sizes" / "2.png", torch.rand(30, 32, 3))
-    draw_folder(root / "one", 1)
-    draw_folder(root / "corrupt", 3)
-    whole = (root / "corrupt" / "1.png").read_bytes()
-    (root / "corrupt" / "1.png").write_bytes(whole[: len(whole) // 2])
-    (root / "empty").mkdir()
-    return root
-
-
-REFUSED = {
-    "a misspelt key": (["scene=folder", "scene.root={good}", "optim.lrr=1"], ["optim.lrr", "lr", "batch_pixels"]),
-    "a misspelt group": (["scene=folder", "scene.root={good}", "optin.lr=1"], ["optin", "optim"]),
-    "a wrong type": (["scene=folder", "scene.root={good}", "optim.steps=many"], ["optim.steps", "many", "Integer"]),
-    "a choice that is none": (["scene=folder", "scene.root={good}", "scene.holdout=some"], ["standard", "none"]),
-    "an unknown scene": (["scene=stanford/legos"], ["stanford/legos", "stanford/lego,", "llff/fern", "demo"]),
-    "an unknown model": (["scene=folder", "scene.root={good}", "model=papier"], ["papier", "paper"]),
-    "no root": (["scene=folder"], ["scene.root"]),
-    "a missing folder": (["scene=folder", "scene.root={odd}/nowhere"], ["scene.root", "nowhere", "corrupt, empty"]),
-    "a missing archive": (["scene=stanford/knights", "paths.data={odd}"], ["viinter.download scene=stanford/knights"]),
-    "views of different sizes": (["scene=folder", "scene.root={odd}/sizes"], ["2.png", "32 x 30", "one size"]),
-    "a folder with one image": (["scene=folder", "scene.root={odd}/one"], ["1 image", "0.png", "at least 2"]),
-    "a folder without images": (["scene=folder", "scene.root={odd}/empty"], ["no images", ".png"]),
-    "an unreadable file": (["scene=folder", "scene.root={odd}/corrupt"], ["corrupt/1.png"]),
-    "alpha without weights": (
-        ["scene=folder", "scene.root={good}", "interpolation.alpha=0.1", "features.weights=null"],
-        ["features.weights", "interpolation.alpha", "path of a file"],
-    ),
-    "weights that are not there": (
-        ["scene=folder", "scene.root={good}", "interpolation.alpha=0.1", "features.weights={odd}/clip.pt"],
-        ["features.weights", "clip.pt"],
-    ),
-    "p below 1": (["scene=folder", "scene.root={good}", "codes.p=0.5"], ["codes.p=0.5", "none, inf", ">= 1"]),
-    "a rate of zero": (["scene=folder", "scene.root={good}", "optim.lr=0"], ["optim.lr=0", "above 0"]),
-    "an accelerator that is none": (
-        ["scene=folder", "scene.root={good}", "trainer.accelerator=abacus"], ["trainer.", "abacus", "cpu"],
-    ),
-    "a precision that is none": (
-        ["scene=folder", "scene.root={good}", "trainer.precision=12"], ["trainer.", "12", "bf16-mixed"],
-    ),
-    "a run to go on with that is none": (["resume={odd}/nowhere"], ["nowhere", "no run folder"]),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_run_ends_at_once_with_one_clear_message(command_line, drawn, odd, tmp_path, case):
-    arguments, words = REFUSED[case]
-    arguments = [a.format(good=drawn("folder"), odd=odd) for a in arguments]
-    few = [] if case == "a run to go on with that is none" else ["scale=smoke", "trainer.accelerator=cpu"]
-    found = command_line("viinter.train", *few, *arguments, cwd=tmp_path)
-    assert found.code not in (0, None)
-    for word in words:
-        assert word in found.err
-    assert "Traceback" not in found.err + found.out
-    assert len(found.err.splitlines()) < 15
-    assert found.seconds < 30
-    assert not list(tmp_path.rglob("*.ckpt"))
-
-
-@pytest.mark.parametrize(
-    ("module", "arguments", "words"),
-    [("render", ["run=nowhere"], ["nowhere", "no run folder"]), ("evaluate", ["run=nowhere"], ["nowhere"]),
-     ("render", [], ["run=VALUE"]), ("evaluate", ["run=nowhere", "finetun_steps=3"], ["finetun_steps"]),
-     ("download", ["scene=stanford/legos"], ["stanford/legos", "stanford/lego"])],
-)  # fmt: skip
-def test_the_other_doors_refuse_as_clearly(command_line, tmp_path, module, arguments, words):
-    found = command_line(f"viinter.{module}", *arguments, cwd=tmp_path)
-    assert found.code not in (0, None)
-    for word in words:
-        assert word in found.err
-    assert "Traceback" not in found.err + found.out
-    assert not list(tmp_path.iterdir())
 
 
 # From end to end

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import errno
 import os
 import platform
 import signal
@@ -19,7 +20,7 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
+from hydra.errors import CompactHydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
@@ -84,7 +85,8 @@ def show_help(schema: Any, module: str, about: str) -> None:
 
 
 def check_keys(schema: type, arguments: list[str]) -> None:
-    """Raises ConfigError for a `scene=` that does not exist or a key that no dataclass has, with those that do.
+    """Raises ConfigError for a `scene=`, `model=`, ... that does not exist or a key that no dataclass has, with those
+    that do.
 
     Hydra refuses them too, but does not say what it would accept.
     """
@@ -92,8 +94,9 @@ def check_keys(schema: type, arguments: list[str]) -> None:
         key, equals, value = argument.partition("=")
         if not equals or key.startswith(("-", "+", "~", "hydra")):
             continue
-        if key == "scene" and not set(",(") & set(value) and value not in choices("scene"):
-            raise ConfigError(f"scene={value}: there is no such scene. There are: {', '.join(choices('scene'))}")
+        known = choices(key) if key in ("scene", "model", "scale", "experiment") else []
+        if known and not set(",(") & set(value) and value not in [*known, "null"]:
+            raise ConfigError(f"{argument}: there is no such {key}. There are: {', '.join(known)}")
         nodes: list[Any] = [schema()]
         for depth, part in enumerate(key.split(".")):
             fields = {f.name for node in nodes if dataclasses.is_dataclass(node) for f in dataclasses.fields(node)}
@@ -104,6 +107,15 @@ def check_keys(schema: type, arguments: list[str]) -> None:
             nodes = [getattr(node, part) for node in nodes if hasattr(node, part)]
             if part == "model":
                 nodes = [model() for model in MODELS.values()]
+
+
+def quoted(argument: str) -> str:
+    """`key=value` with quotes round a value that has other letters than ASCII's, which Hydra takes in quotes alone."""
+    key, equals, value = argument.partition("=")
+    if not equals or value.isascii() or value[0] in "'\"[{":
+        return argument
+    escaped = value.replace("'", "\\'")
+    return f"{key}='{escaped}'"
 
 
 def one_device(devices: Any) -> None:
@@ -157,6 +169,7 @@ def main(
                 raise
             sys.exit(f"{type(error).__name__}: {error}")
 
+    sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then passes errors on instead of printing a part of their traceback
     try:
         job()
@@ -164,9 +177,12 @@ def main(
         sys.exit(str(interrupt) or "interrupted")
     except UserError as error:
         sys.exit(f"{type(error).__name__}: {error}")
+    except OverrideParseException as error:
+        sys.exit(f"{error.override}: {error}")
     except CompactHydraException as error:
         sys.exit("\n".join(str(e) for e in (error, error.__cause__) if e))
-    except OSError as error:
-        if error.filename is None:
+    except OSError as error:  # of Hydra, which writes the settings before the job begins
+        if error.filename is None and error.errno != errno.ENOSPC:
             raise
-        sys.exit(f"UserError: {error.filename}: {error.strerror}; expected a place that can be written")
+        place = error.filename or f"the run folder below {Path.cwd()}"
+        sys.exit(f"UserError: {place}: {error.strerror}; expected a place that can be written")

@@ -15,6 +15,7 @@ import contextlib
 import difflib
 import functools
 import importlib
+import pickle
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -409,5 +410,7 @@ def _unfit(file: Path, why: str) -> UserError:
 
 
 def _brief(error: Exception) -> str:
+    if isinstance(error, pickle.UnpicklingError):  # PyTorch's own words advise to run what the file holds
+        return "it holds something other than tensors, or is no file of weights"
     first = (str(error).strip() or "no further word").splitlines()[0]
     return f"{type(error).__name__}: {first[:200]}"
