@@ -1,8 +1,9 @@
 """Drawing and measuring, with a field that is known in closed form."""
 
+import pytest
 import torch
 
-from viinter.config import Layout
+from viinter.config import Layout, UserError
 from viinter.scenes import Probe, Scene
 from viinter.views import draw, measure, pixel_grid
 
@@ -59,3 +60,34 @@ def test_measure_draws_known_views_from_their_codes_and_probes_from_their_mixes(
     assert seen == [("known", 0), ("known", 1), ("novel", 0)]
     probes["novel"][0].target += 0.1
     assert measure(field, codes, scene, ["novel"])["novel"]["mse"] > 1e-3
+
+
+class Hungry(torch.nn.Module):
+    """Asks for more memory than there is for more than `most` pixels at a time."""
+
+    def __init__(self, most):
+        super().__init__()
+        self.most, self.drawn = most, []
+
+    def forward(self, xy, z):
+        if xy.shape[1] > self.most:
+            torch.empty(2**60, dtype=torch.uint8)
+        self.drawn.append(xy.shape[1])
+        return torch.cat([xy, xy[..., :1]], -1)
+
+
+def test_if_memory_runs_out_half_as_many_rows_are_drawn_at_a_time():
+    plain, hungry = Hungry(10**6), Hungry(70)
+    expected = draw(plain, torch.zeros(3), 33, 20)
+    assert torch.equal(draw(hungry, torch.zeros(3), 33, 20, chunk_pixels=300), expected)
+    assert hungry.drawn == [60] * 11
+    with pytest.raises(UserError, match="out of memory: one row of 20 pixels"):
+        draw(Hungry(19), torch.zeros(3), 33, 20)
+
+
+def test_other_errors_of_a_field_pass_through():
+    def broken(xy, z):
+        raise RuntimeError("shapes do not fit")
+
+    with pytest.raises(RuntimeError, match="shapes do not fit"):
+        draw(broken, torch.zeros(3), 4, 4)

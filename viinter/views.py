@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from viinter import metrics
 from viinter.codes import mix
+from viinter.config import UserError
 from viinter.scenes import Scene
 
 
@@ -29,13 +30,25 @@ def pixel_grid(
 def draw(field: nn.Module, z: Tensor, height: int, width: int, chunk_pixels: int = 131_072) -> Tensor:
     """The view [H, W, 3] float32 (not clamped) that `field` shows under the code `z` [M], `chunk_pixels` at a time.
 
-    The field is continuous, so any size can be drawn; memory grows with `chunk_pixels`, not with the size.
+    The field is continuous, so any size can be drawn; memory grows with `chunk_pixels`, not with the size. If memory
+    runs out, half as many rows are drawn at a time from there on. Raises UserError if one row is too much.
     """
     rows = max(1, chunk_pixels // width)
     parts = []
-    grid = pixel_grid(height, width, z.device, torch.promote_types(z.dtype, torch.float32))
-    for xy in grid.split(rows * width):
-        parts.append(field(xy[None], z[None])[0].float())
+    grid = pixel_grid(height, width, z.device, torch.promote_types(z.dtype, torch.float32)).view(height, width, 2)
+    start = 0
+    while start < height:
+        try:
+            parts.append(field(grid[start : start + rows].reshape(1, -1, 2), z[None])[0].float())
+        except (torch.OutOfMemoryError, RuntimeError) as error:
+            # on the CPU it is a RuntimeError like any other but for its words
+            if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
+                raise
+            if rows == 1:
+                raise UserError(f"out of memory: one row of {width} pixels is too much to draw at a time") from error
+            rows //= 2
+        else:
+            start += rows
     return torch.cat(parts).reshape(height, width, 3)
 
 
