@@ -1,17 +1,19 @@
-"""`python -m viinter.bench step`: what the framework costs over the same step in a bare PyTorch loop.
+"""`python -m viinter.bench step | alpha`: what the framework costs over the same step in a bare PyTorch loop, and
+what the interpolation loss costs where a scene wants it.
 
-The two are timed in turns in one process: after every step of the real training, with all its callbacks, a twin of
-the model takes one step in plain PyTorch. Whatever the machine does meanwhile, it does to both.
+A step and its bare twin are timed in turns in one process: after every step of the real training, with all its
+callbacks, a twin of the model takes one step in plain PyTorch. Whatever the machine does meanwhile, it does to both.
 """
 
 from __future__ import annotations
 
 import itertools
+import multiprocessing
 import statistics
-import sys
 import tempfile
 import time
 from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from viinter import command
+from viinter import command, config
 from viinter.config import TrainConfig
 from viinter.data import PixelStore
 from viinter.module import ViewInterpolator
@@ -32,6 +34,7 @@ says where the time goes. Settings are those of viinter.train.
 
   python -m viinter.bench step                                       width 128, depth 5, the shipped scene, 200 steps
   python -m viinter.bench step model.width=512 model.depth=8 threads=2
+  python -m viinter.bench alpha model=fast                           the same run with and without L_inter and its tower
 """
 
 WARM_UP = 10
@@ -106,11 +109,11 @@ class BareTwin(L.Callback):
         self.since = self._now(module.device)
 
 
-def step(cfg: TrainConfig) -> dict[str, Any]:
+def step(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     """Median seconds of a step through `train` and in the bare loop, their ratio, and the parts; printed as a table."""
     twin = BareTwin(cfg)
-    with tempfile.TemporaryDirectory() as folder:
-        train(cfg, Path(folder), more_callbacks=[twin])
+    with tempfile.TemporaryDirectory() as run:
+        train(cfg, Path(run), more_callbacks=[twin])
     framework, bare = (statistics.median(times[WARM_UP:]) for times in (twin.framework, twin.bare))
     ratios = sorted(a / b for a, b in zip(twin.framework[WARM_UP:], twin.bare[WARM_UP:], strict=True))
     found = {
@@ -135,22 +138,79 @@ def step(cfg: TrainConfig) -> dict[str, Any]:
     return found
 
 
-BENCHES = {"step": step}
-PRESETS = {"step": ["model.width=128", "model.depth=5", "optim.steps=210", "logging.pictures=false",
-                    "evaluation.max_share=0"]}  # fmt: skip
+def alpha(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
+    """What a scene with `interpolation.alpha=0` saves: the same training with and without L_inter, each in a process of
+    its own; seconds a step, seconds of start-up, peak megabytes, and their differences; printed as a table.
+
+    Where `features.weights` is not given, the tower is filled with random numbers: time and memory are the same.
+    """
+    found = {}
+    with tempfile.TemporaryDirectory() as place:
+        for name, weight in (("without", 0.0), ("with", cfg.interpolation.alpha or 1.0)):
+            changes = [f"interpolation.alpha={weight}"]
+            if weight and cfg.features.weights is None:
+                changes.append(f"features.weights={random_tower(cfg.features.model, Path(place))}")
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+                found[name] = process.submit(one_run, config.from_plain(config.plain(cfg), changes)).result()
+    rows = {key: (found["without"][key], found["with"][key]) for key in found["with"]}
+    table = Table(title=f"{cfg.scene.name}, model={cfg.model.name}: L_inter every {cfg.interpolation.every} steps",
+                  title_justify="left")  # fmt: skip
+    for column in ("", "without", "with", "saved"):
+        table.add_column(column, justify="right" if column else "left")
+    for key, (without, with_it) in rows.items():
+        table.add_row(key, f"{without:.3f}", f"{with_it:.3f}", f"{with_it - without:.3f}")
+    Console().print(table)
+    return {key: {"without": a, "with": b, "saved": b - a} for key, (a, b) in rows.items()}
+
+
+def one_run(cfg: TrainConfig) -> dict[str, float]:
+    """Time and memory of one training, to be called in a process of its own: its peak memory is then the run's."""
+    begin, watch = time.perf_counter(), StepTimes()
+    with tempfile.TemporaryDirectory() as folder:
+        found = train(cfg, Path(folder), more_callbacks=[watch])
+    return {"seconds a step": statistics.mean(watch.seconds[WARM_UP:]),
+            "seconds before the first step": watch.started - begin, "peak MB": found["peak_memory_mb"]}  # fmt: skip
+
+
+class StepTimes(L.Callback):
+    """Seconds from the end of a step to that of the next."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+
+    def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        self.started = self.since = time.perf_counter()
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
+        now = time.perf_counter()
+        self.seconds.append(now - self.since)
+        self.since = now
+
+
+def random_tower(model: str, folder: Path) -> Path:
+    """A file of weights for the image half of the CLIP architecture `model`, all of them random."""
+    import open_clip
+
+    file = folder / "random.pt"
+    torch.save(open_clip.create_model(model, pretrained=None).visual.state_dict(), file)
+    return file
+
+
+BENCHES = {"step": step, "alpha": alpha}
+
+
+def presets(what: str, arguments: list[str]) -> list[str]:
+    """Settings for a bench of a minute; sizes of the published network's where it is the one that is timed."""
+    found = ["logging.pictures=false", "evaluation.max_share=0", "optim.training_seconds=null", "hydra.run.dir=.",
+             "hydra.output_subdir=null", f"optim.steps={210 if what == 'step' else 50}"]  # fmt: skip
+    if not any(a.startswith("model=") and a != "model=paper" for a in arguments):
+        found += ["model.width=128", "model.depth=5"]
+    return found
 
 
 def main() -> None:
     """`python -m viinter.bench WHAT key=value ...`."""
-    if len(sys.argv) == 1:
-        sys.argv.append("--help")
-    asked = sys.argv[1]
-    if asked not in BENCHES and asked not in ("--help", "-h"):
-        sys.exit(f"{asked}: there is no such bench. There are: {', '.join(BENCHES)}")
-    if asked in BENCHES:
-        no_folder = ["hydra.run.dir=.", "hydra.output_subdir=null"]
-        sys.argv = [sys.argv[0], *PRESETS[asked], *no_folder, *sys.argv[2:]]
-    command.main(TrainConfig, "train", lambda cfg, _: BENCHES[asked](cfg), ABOUT)
+    command.one_of(BENCHES, presets, ABOUT)
 
 
 if __name__ == "__main__":

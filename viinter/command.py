@@ -26,7 +26,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from viinter.config import MODELS, REPOSITORY, ConfigError, UserError, describe, several, typed
+from viinter.config import MODELS, REPOSITORY, ConfigError, TrainConfig, UserError, describe, several, typed
 from viinter.files import failure_noted
 
 CONF = REPOSITORY / "conf"
@@ -186,3 +186,21 @@ def main(
             raise
         place = error.filename or f"the run folder below {Path.cwd()}"
         sys.exit(f"UserError: {place}: {error.strerror}; expected a place that can be written")
+
+
+def one_of(
+    functions: dict[str, Callable[[Any, Path], Any]], presets: Callable[[str, list[str]], list[str]], about: str
+) -> None:
+    """A door with several functions over the settings of training: `python -m viinter.DOOR WHAT key=value ...`.
+
+    `presets(WHAT, arguments)` are settings that come before those of the command line. Without arguments the help is
+    shown; an unknown WHAT ends the process with those that there are.
+    """
+    asked = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if asked in functions:
+        sys.argv = [sys.argv[0], *presets(asked, sys.argv[2:]), *sys.argv[2:]]
+    elif asked in ("--help", "-h"):
+        sys.argv = [sys.argv[0], "--help"]
+    else:
+        sys.exit(f"{asked}: there is no such thing here. There are: {', '.join(functions)}")
+    main(TrainConfig, "train", lambda cfg, folder: functions[asked](cfg, folder), about)

@@ -1,12 +1,11 @@
 """`python -m viinter.stability map | precision | long`: where training stops working, and how far the defaults are
 from there; float32 against float64; two hundred thousand steps in a row.
 
-Each writes a report, its figure and its numbers into `outputs/stability/<scene>/<model>/<what>/`.
+Each writes its numbers, and a report as Markdown and HTML, into `outputs/stability/<scene>/<model>/<what>/`.
 """
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 import logging
@@ -23,15 +22,16 @@ from typing import Any
 import lightning as L
 import matplotlib
 import torch
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 
-from viinter import command, config, metrics, scenes, twin
+from viinter import command, config, metrics, page, scenes, twin
 from viinter.callbacks import Budget
 from viinter.config import ConfigError, TrainConfig
-from viinter.files import whole
 from viinter.guard import DivergenceError
 from viinter.module import ViewInterpolator
+from viinter.page import Picture, Section, Table
 from viinter.train import train, write_json
 
 matplotlib.use("Agg")
@@ -159,7 +159,7 @@ def flat_error(cfg: TrainConfig) -> float:
 
 
 def stability_map(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
-    """Trains all of `plan`, and writes `map.json`, `map.png` and `report.md`. Runs that `map.json` holds already are
+    """Trains all of `plan`, and writes `map.json` and the report. Runs that `map.json` holds already are
     not repeated; raises ConfigError if they were made with other settings."""
     file, base = folder / "map.json", config.plain(cfg)
     found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"settings": base, "runs": {}}
@@ -175,16 +175,16 @@ def stability_map(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     for run in found["runs"].values():
         run["verdict"] = verdict(run, found["runs"]["default"], found["flat_mse"])
     write_json(file, found)
-    draw_map(folder / "map.png", cfg, found)
-    return finish_report(folder, map_report(cfg, found), found)
+    text = f"Where training stops working: {circumstances(cfg)}"
+    return finish(folder, text, map_section(cfg, found), found)
 
 
-def finish_report(folder: Path, lines: list[str], found: dict[str, Any]) -> dict[str, Any]:
-    """Writes `report.md`, prints it, and passes `found` on."""
-    with whole(folder / "report.md") as part:
-        part.write_text("\n".join(lines) + "\n")
-    Console(soft_wrap=True).print("\n".join(lines), markup=False, highlight=False)
-    Console(soft_wrap=True).print(f"\n{folder}: {', '.join(sorted(f.name for f in folder.iterdir()))}", markup=False)
+def finish(folder: Path, title: str, section: Section, found: dict[str, Any]) -> dict[str, Any]:
+    """Writes the page, prints it, and passes `found` on."""
+    page.write(folder, title, [section])
+    console = Console(soft_wrap=True)
+    console.print((folder / "report.md").read_text(), markup=False, highlight=False)
+    console.print(f"{folder}: {', '.join(sorted(f.name for f in folder.iterdir()))}", markup=False, highlight=False)
     return found
 
 
@@ -193,14 +193,9 @@ def circumstances(cfg: TrainConfig) -> str:
             f"PyTorch {torch.__version__}, CPU")  # fmt: skip
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
-    """A Markdown table."""
-    return ["| " + " | ".join(map(str, row)) + " |" for row in (head, ["---"] * len(head), *rows)]
-
-
-def map_report(cfg: TrainConfig, found: dict[str, Any]) -> list[str]:
+def map_section(cfg: TrainConfig, found: dict[str, Any]) -> Section:
     runs, known = found["runs"], {axis.name: axis for axis in axes(cfg)}
-    default, flat = runs["default"], -10 * math.log10(found["flat_mse"])
+    flat = -10 * math.log10(found["flat_mse"])
 
     def at(*chosen: tuple[Axis, str]) -> dict[str, Any]:
         return runs[key({axis.name: value for axis, value in chosen if value != axis.default})]
@@ -213,36 +208,38 @@ def map_report(cfg: TrainConfig, found: dict[str, Any]) -> list[str]:
 
     stopped, refused = (sum(run["ended"] == ended for run in runs.values()) for ended in ("stopped", "refused"))
     restarted = sum(bool(run.get("restarts")) for run in runs.values())
-    lines = [
-        f"# Where training stops working: {circumstances(cfg)}", "",
-        f"{len(runs)} trainings of {cfg.optim.steps} steps of {cfg.optim.batch_pixels} pixels at "
-        f"{found['settings']['scene']['downsample']}-fold reduction, {sum(r['seconds'] for r in runs.values()):.0f} s "
-        f"in all. The default has optim.lr={cfg.optim.lr:g} and comes to {decibel(default['mse'])} dB at the probes; "
-        f"one flat colour has {flat:.1f}. Works: at most {CLOSE:g} dB below the default. Fails: stopped by the guard, "
-        f"or no better than the flat colour. {stopped} runs were stopped, {restarted} restarted and finished, "
-        f"{refused} refused by the settings' check; all others were finite throughout.", "", "![map](map.png)", "",
-    ]  # fmt: skip
-    lines += table(["", "works", "worse", "fails", "refused"], [
-        [name, *(", ".join(v for v in axis.values if at((axis, v))["verdict"] == kind) or "-"
-                 for kind in ("works", "worse", "fails", "refused"))]
+    text = (
+        f"{len(runs)} trainings of {cfg.optim.steps} steps of {cfg.optim.batch_pixels} pixels, views reduced "
+        f"{cfg.scene.downsample}-fold, {sum(r['seconds'] for r in runs.values()):.0f} s in all. The default has "
+        f"`optim.lr={cfg.optim.lr:g}` and comes to {decibel(runs['default']['mse'])} dB at the probes; one flat colour "
+        f"has {flat:.1f}. Works: at most {CLOSE:g} dB below the default. Fails: stopped by the guard, or no better "
+        f"than the flat colour. {stopped} runs were stopped, {restarted} restarted and finished, {refused} refused by "
+        f"the settings' check; all others were finite throughout."
+    )
+    verdicts = ("works", "worse", "fails", "refused")
+    rows = [
+        [name, *(", ".join(v for v in axis.values if at((axis, v))["verdict"] == kind) or "-" for kind in verdicts)]
         for name, axis in known.items()
-    ])  # fmt: skip
-    lines += ["", "One at a time (PSNR of the mean squared error at the probes, in dB):", ""]
+    ]
+    items = [
+        text, Table("One setting changed at a time", ["setting", *verdicts], rows),
+        Picture("PSNR of the mean squared error at the probes in dB", lambda: map_figure(cfg, found)),
+    ]  # fmt: skip
     for name, axis in known.items():
-        lines += [*table([name, *axis.values], [["", *(cell(at((axis, v))) for v in axis.values)]]), ""]
+        items.append(Table(name, axis.values, [[cell(at((axis, v))) for v in axis.values]]))
     for first, second in pairs(cfg):
         a, b = known[first], known[second]
         rows = [[v, *(cell(at((a, u), (b, v))) for u in a.values)] for v in b.values]
-        lines += [f"{first} (across) with {second} (down):", "", *table(["", *a.values], rows), ""]
-    return lines
+        items.append(Table(f"{first} and {second}", [f"{second} \\ {first}", *a.values], rows))
+    return Section("map", "The map", items)
 
 
 def decibel(mse: float) -> str:
     return f"{-10 * math.log10(mse):.1f}" if mse > 0 else "exact"
 
 
-def draw_map(file: Path, cfg: TrainConfig, found: dict[str, Any]) -> None:
-    """One panel an axis and one a pair: the PSNR in each cell, crossed out where training fails."""
+def map_figure(cfg: TrainConfig, found: dict[str, Any]) -> Figure:
+    """One panel an axis and one a pair: the PSNR in each cell, grey where training fails."""
     known = {axis.name: axis for axis in axes(cfg)}
     nothing = Axis("", "", [""], lambda _: {})
     panels = [(axis, nothing) for axis in known.values()] + [(known[a], known[b]) for a, b in pairs(cfg)]
@@ -268,10 +265,8 @@ def draw_map(file: Path, cfg: TrainConfig, found: dict[str, Any]) -> None:
         frame.set_yticks(range(len(b.values)), b.values, fontsize=7)
         frame.set_title(a.name, fontsize=8, loc="left", pad=2)
         frame.tick_params(length=0)
-    figure.suptitle(f"PSNR at the probes, dB: {circumstances(cfg)}", fontsize=8)
-    with whole(file) as part:
-        figure.savefig(part, dpi=110)
-    plt.close(figure)
+    figure.suptitle(circumstances(cfg), fontsize=8)
+    return figure
 
 
 def corners(cfg: TrainConfig) -> dict[str, list[str]]:
@@ -291,7 +286,7 @@ def corners(cfg: TrainConfig) -> dict[str, list[str]]:
 
 def precision(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     """Relative errors of the field, the projection and L_inter against float64, and of the compiled against the eager
-    field; `precision.json` and `report.md`."""
+    field; `precision.json` and the report."""
     found: dict[str, Any] = {"field": {}, "projection": {}, "interpolation_loss": {}, "compiled": None}
     for name, changes in track(corners(cfg).items(), "float64 twins", disable=not cfg.logging.progress):
         found["field"][name] = twin.field_errors(config.from_plain(config.plain(cfg), changes))
@@ -305,23 +300,24 @@ def precision(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
         found["compiled"] = twin.compiled_errors(cfg)
     write_json(folder / "precision.json", found)
 
-    def number(value: float) -> str:
-        return f"{value:.1e}"
+    def rows(part: dict[str, dict]) -> list[list[str]]:
+        return [[name, *(f"{e:.1e}" for e in errors.values())] for name, errors in part.items()]
 
-    lines = [f"# Relative errors against float64: {circumstances(cfg)}", ""]
-    head = ["field", *(f"{p}: {what}" for p in ("float32", "bf16-mixed") for what in ("value", "loss", "gradient"))]
-    lines += table(head, [[name, *(number(e) for by in errors.values() for e in by.values())]
-                          for name, errors in found["field"].items()])  # fmt: skip
+    kinds = ("value", "loss", "gradient")
+    side_by_side = {
+        name: {f"{precision}: {kind}": errors[precision][kind] for precision in errors for kind in kinds}
+        for name, errors in found["field"].items()
+    }
+    items = [Table("The field and its training step", ["setting", *side_by_side["default"]], rows(side_by_side))]
     for part in ("projection", "interpolation_loss"):
-        rows = [[name, *map(number, errors.values())] for name, errors in found[part].items()]
-        lines += ["", *table([part.replace("_", " "), "value", "gradient"], rows)]
-    lines.append("")
+        items.append(Table(part.replace("_", " "), ["case", "value", "gradient"], rows(found[part])))
     if found["compiled"]:
-        lines += table(["compiled against eager, float32", *found["compiled"]],
-                       [["default", *map(number, found["compiled"].values())]])  # fmt: skip
+        compiled = rows({"default": found["compiled"]})
+        items.append(Table("Compiled against eager, float32", ["setting", *kinds], compiled))
     else:
-        lines.append("**Compiled against eager: not compared.** torch.compile needs a C++ compiler, and there is none.")
-    return finish_report(folder, lines, found)
+        items.append("**Compiled against eager: not compared.** `torch.compile` wants a C++ compiler; there is none.")
+    title = f"Relative errors against float64: {circumstances(cfg)}"
+    return finish(folder, title, Section("precision", "Relative errors", items), found)
 
 
 class Odometer(L.Callback):
@@ -354,7 +350,7 @@ class Odometer(L.Callback):
 
 
 def long(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
-    """Many cheap steps; `long.csv`, `long.png`, `report.md`. Returns `{"checks": {what: (number, bound)}, "rows"}`.
+    """Many cheap steps; `long.json` and the report. Returns `{"checks": {what: (number, bound)}, "rows"}`.
 
     Held are: the number of steps; the codes' norms and the schedule against their formulas at every note; the training
     clock, which must not run ahead of a stop-watch nor change its share of it between the first and the last tenth of
@@ -381,10 +377,17 @@ def long(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
             (abs(share(rows[-tenth - 1 :]) - share(rows[: tenth + 1])), 0.1),
         "MB that the last nine tenths add": (rows[-1]["peak_memory_mb"] - rows[tenth - 1]["peak_memory_mb"], 16.0),
     }  # fmt: skip
-    with whole(folder / "long.csv") as part, part.open("w", newline="") as out:
-        sheet = csv.DictWriter(out, list(rows[0]))
-        sheet.writeheader()
-        sheet.writerows(rows)
+    text = f"{metrics_found['training_seconds']:.0f} training seconds, {metrics_found['wall_seconds']:.0f} wall."
+    held = [[what, f"{value:.3g}", f"{bound:g}", "held" if value <= bound else "**not held**"]
+            for what, (value, bound) in checks.items()]  # fmt: skip
+    section = Section("long", "What must not drift", [
+        text, Table("Held", ["", "found", "at most", ""], held), Picture("Over the run", lambda: long_figure(rows)),
+    ])  # fmt: skip
+    write_json(folder / "long.json", {"checks": checks, "rows": rows})
+    return finish(folder, f"{cfg.optim.steps} steps: {circumstances(cfg)}", section, {"checks": checks, "rows": rows})
+
+
+def long_figure(rows: list[dict[str, float]]) -> Figure:
     figure, frames = plt.subplots(2, 2, figsize=(8, 5), layout="constrained", sharex=True)
     shown = {"norm_error": "relative error of a code's norm", "rate_error": "relative error of the rate",
              "training_seconds": "training seconds", "peak_memory_mb": "peak memory, MB"}  # fmt: skip
@@ -392,31 +395,23 @@ def long(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
         frame.plot([r["step"] for r in rows], [r[name] for r in rows])
         frame.set_title(title, fontsize=9)
         frame.set_xlabel("step")
-    with whole(folder / "long.png") as part:
-        figure.savefig(part, dpi=110)
-    plt.close(figure)
-    lines = [
-        f"# {cfg.optim.steps} steps: {circumstances(cfg)}", "",
-        f"{metrics_found['training_seconds']:.0f} training seconds, {metrics_found['wall_seconds']:.0f} wall.", "",
-        *table(["", "found", "at most", ""], [[what, f"{value:.3g}", f"{bound:g}", "held" if value <= bound else
-                                               "**not held**"] for what, (value, bound) in checks.items()]),
-        "", "![what must not drift](long.png)",
-    ]  # fmt: skip
-    return finish_report(folder, lines, {"checks": checks, "rows": rows})
+    return figure
 
 
 REPORTS = {"map": stability_map, "precision": precision, "long": long}
 QUIET = ["trainer.accelerator=cpu", "logging.pictures=false", "evaluation.max_share=0", "optim.training_seconds=null"]
 
 
-def presets(what: str, model: str) -> list[str]:
+def presets(what: str, arguments: list[str]) -> list[str]:
     """The settings that a report varies, smaller than those of a training: a run of a second or two."""
+    model = next((a.partition("=")[2] for a in arguments if a.startswith("model=")), "paper")
     found = [*QUIET, f"hydra.run.dir=outputs/stability/${{hydra:runtime.choices.scene}}/{model}/{what}",
              "hydra.output_subdir=null"]  # fmt: skip
     if what == "map":
-        found += ["scene.downsample=4", "threads=1"]
-        sizes = {"paper": ["optim.steps=300", "optim.batch_pixels=2048", "model.width=64", "model.depth=4"],
-                 "fast": ["optim.steps=200", "optim.batch_pixels=4096"]}  # fmt: skip
+        found += ["threads=1"]
+        sizes = {"paper": ["scene.downsample=8", "optim.steps=200", "optim.batch_pixels=1024", "model.width=64",
+                           "model.depth=4"],
+                 "fast": ["scene.downsample=4", "optim.steps=150", "optim.batch_pixels=2048"]}  # fmt: skip
         found += ["scale=cpu", *sizes.get(model, [])]
     elif what == "precision":
         found += ["scale=cpu"]
@@ -429,15 +424,7 @@ def presets(what: str, model: str) -> list[str]:
 
 def main() -> None:
     """`python -m viinter.stability WHAT key=value ...`."""
-    if len(sys.argv) == 1:
-        sys.argv.append("--help")
-    asked = sys.argv[1]
-    if asked not in REPORTS and asked not in ("--help", "-h"):
-        sys.exit(f"{asked}: there is no such report. There are: {', '.join(REPORTS)}")
-    if asked in REPORTS:
-        model = next((a.partition("=")[2] for a in sys.argv if a.startswith("model=")), "paper")
-        sys.argv = [sys.argv[0], *presets(asked, model), *sys.argv[2:]]
-    command.main(TrainConfig, "train", lambda cfg, folder: REPORTS[asked](cfg, folder), ABOUT)
+    command.one_of(REPORTS, presets, ABOUT)
 
 
 if __name__ == "__main__":
