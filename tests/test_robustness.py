@@ -253,7 +253,7 @@ ROWS = {row.what: row for rows in TABLES.values() for row in rows}
 def message(row: Row, here: Path, command_line: Callable) -> str:
     """What `row.command` says when typed in `here`, with `here` shown as DIR; asserts how it ends."""
     row.make(here)
-    before = {file for file in here.rglob("*") if not file.is_dir()}
+    before = {file: file.stat().st_mtime_ns for file in here.rglob("*") if file.is_file()}
     module, *arguments = [word.strip("'") for word in row.command.split(" ")]
     few = FEW if module == "viinter.train" and "resume=run" not in arguments else []
     sweep = arguments[:1] if arguments[:1] == ["-m"] else []
@@ -267,7 +267,9 @@ def message(row: Row, here: Path, command_line: Callable) -> str:
         assert word in said, said
     assert not (here / "executed").exists()
     # nothing is half written: only a run's settings and its reason are new
-    new = {file for file in here.rglob("*") if not file.is_dir()} - before
+    after = {file: file.stat().st_mtime_ns for file in here.rglob("*") if file.is_file()}
+    assert before.items() <= after.items()
+    new = after.keys() - before.keys()
     assert {file.parent.name if file.parent.name == ".hydra" else file.name for file in new} <= {
         ".hydra", "failure.txt", "multirun.yaml",
     }  # fmt: skip
@@ -279,6 +281,7 @@ def message(row: Row, here: Path, command_line: Callable) -> str:
 
 def line(row: Row, said: str) -> str:
     shown = re.sub(r"x{50,}", "xxx...", said.replace("\n", "<br>").replace("|", "\\|"))
+    shown = re.sub(r"((?:Accepted|There) (?:there|are): [^<]{60})[^<]+", r"\1 ...", shown)  # such lists grow
     shown = shown if len(shown) < 320 else shown[:320] + " ..."
     command = re.sub(r"x{50,}", "xxx...", row.command)
     return f"| {row.what} | `{command}` | {shown} |"

@@ -94,7 +94,7 @@ def check_keys(schema: type, arguments: list[str]) -> None:
         key, equals, value = argument.partition("=")
         if not equals or key.startswith(("-", "+", "~", "hydra")):
             continue
-        known = choices(key) if key in ("scene", "model", "scale", "experiment") else []
+        known = choices(key) if key in ("scene", "model", "scale", "tower", "experiment") else []
         if known and not set(",(") & set(value) and value not in [*known, "null"]:
             raise ConfigError(f"{argument}: there is no such {key}. There are: {', '.join(known)}")
         nodes: list[Any] = [schema()]
@@ -107,6 +107,15 @@ def check_keys(schema: type, arguments: list[str]) -> None:
             nodes = [getattr(node, part) for node in nodes if hasattr(node, part)]
             if part == "model":
                 nodes = [model() for model in MODELS.values()]
+
+
+def check_run_dir(arguments: list[str]) -> None:
+    """Raises ConfigError if `hydra.run.dir=` names a run that is there: Hydra would write over its settings."""
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        # the other processes of a run on several devices share its folder
+        if key == "hydra.run.dir" and (Path(value) / ".hydra").exists() and "hydra.output_subdir=null" not in arguments:
+            raise ConfigError(f"{value} holds a run already. Go on with it: python -m viinter.train resume={value}")
 
 
 def quoted(argument: str) -> str:
@@ -150,6 +159,7 @@ def main(
     register(schema, name)
     try:
         check_keys(schema, sys.argv[1:])
+        check_run_dir(sys.argv[1:])
     except ConfigError as error:
         sys.exit(f"ConfigError: {error}")
 
