@@ -196,7 +196,7 @@ def test_the_metrics_are_plain_json_with_the_stated_keys(whole_run):
             each = [view[key] for view in read[kind]["per_view"].values()]
             assert read[kind][key] == pytest.approx(sum(each) / len(each))
     assert read["probes_left_out"] == {"novel": 0, "novel_cells": 0, "novel_quarters": 24}
-    assert all(part.keys() == {"part", "reason"} for part in read["omitted"])
+    assert all(part.keys() == {"part", "reason", "seconds", "megabytes", "how"} for part in read["omitted"])
     assert 0 < read["training_seconds"] < read["wall_seconds"]
     assert (read["steps"], read["seed"]) == (6, 0)
 

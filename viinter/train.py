@@ -12,6 +12,7 @@ import os
 import platform
 import resource
 import sys
+import timeit
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,11 +38,12 @@ from viinter.callbacks import (
     ViewLogger,
 )
 from viinter.checkpoints import Interruption, SaveCheckpoint
-from viinter.codes import path
+from viinter.codes import path, project
 from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.data import SceneData
 from viinter.files import failure_noted, whole
 from viinter.guard import DivergenceError, DivergenceGuard
+from viinter.metrics import SSIM_WINDOW
 from viinter.module import ViewInterpolator, checkpoint_file, read_checkpoint
 from viinter.scenes import Scene
 
@@ -221,18 +223,30 @@ def describe(scene: Scene) -> str:
     return "\n".join([*lines, *(f"  {note}" for note in scene.notes)])
 
 
-def omitted(cfg: TrainConfig, scene: Scene) -> list[dict[str, str]]:
-    """What this scene did not need, and why."""
+def omitted(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, steps: int) -> list[dict[str, Any]]:
+    """What this scene did not need: `{"part", "reason", "seconds", "megabytes", "how"}`, the last three being what it
+    saved over the run, or None where only another run can tell, and how that was or can be measured."""
     found = []
+
+    def left_out(part: str, reason: str, how: str, *saved: float | None) -> None:
+        seconds, megabytes = saved or (None, None)
+        found.append({"part": part, "reason": reason, "seconds": seconds, "megabytes": megabytes, "how": how})
+
     if cfg.interpolation.alpha == 0:
-        found.append({"part": "interpolation step and feature tower", "reason": "interpolation.alpha is 0"})
+        how = "python -m viinter.bench alpha, with the settings of this run"
+        left_out("interpolation step and feature tower", "interpolation.alpha is 0", how)
     if cfg.codes.p == "none":
-        found.append({"part": "code projection", "reason": "codes.p is none"})
+        codes = module.codes.weight.detach()
+        seconds = timeit.timeit(lambda: project(codes, 1.0).sum().item(), number=20) / 20
+        left_out("code projection", "codes.p is none", "timed on these codes, times the steps", seconds * steps, 0.0)
     if not scene.probes["novel"]:
-        found.append({"part": "held-out evaluation", "reason": "the scene has no probes"})
-    found.append({"part": "camera poses and grid positions", "reason": "training never reads them"})
+        left_out("held-out evaluation", "the scene has no probes", "there is no probe to measure it on")
+    if min(scene.height, scene.width) < SSIM_WINDOW:
+        left_out("SSIM", f"views have a side below its window of {SSIM_WINDOW}", "it cannot be computed")
+    left_out("camera poses and grid positions", "training never reads them", "nothing was read or kept", 0.0, 0.0)
     if cfg.trainer.precision == "32-true":
-        found.append({"part": "mixed precision", "reason": "trainer.precision is 32-true"})
+        how = "the same run with trainer.precision=bf16-mixed"
+        left_out("mixed precision", "trainer.precision is 32-true", how)
     return found
 
 
@@ -243,8 +257,9 @@ def facts(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, trainer: L.T
         "training_seconds": clock.seconds, "wall_seconds": clock.wall_seconds, "steps": trainer.global_step,
         "peak_memory_mb": peak, "codes_redrawn": int(module.codes.redrawn),
         "code_length": module.codes.weight.detach().norm(dim=1).mean().item(), "probes_left_out": scene.left_out,
-        "omitted": omitted(cfg, scene), "scene": scene.name, "model": cfg.model.name, "seed": cfg.seed,
-        "threads": torch.get_num_threads(), "device": str(module.device), "precision": cfg.trainer.precision,
+        "omitted": omitted(cfg, scene, module, trainer.global_step), "scene": scene.name, "model": cfg.model.name,
+        "seed": cfg.seed, "threads": torch.get_num_threads(), "device": str(module.device),
+        "precision": cfg.trainer.precision,
         "versions": {"python": platform.python_version(), "torch": torch.__version__, "lightning": L.__version__},
         "hardware": hardware(module.device), "views": scene.n, "height": scene.height, "width": scene.width,
         "settings": config.plain(cfg),
