@@ -100,7 +100,7 @@ def check_keys(schema: type, arguments: list[str]) -> None:
         nodes: list[Any] = [schema()]
         for depth, part in enumerate(key.split(".")):
             fields = {f.name for node in nodes if dataclasses.is_dataclass(node) for f in dataclasses.fields(node)}
-            groups = {folder.name for folder in CONF.iterdir() if folder.is_dir()} if depth == 0 else set()
+            groups = {folder.name for folder in CONF.iterdir() if folder.is_dir()} - {"hydra"} if depth == 0 else set()
             if part not in fields | groups:
                 accepted = ", ".join(sorted(fields | groups)) or "nothing"
                 raise ConfigError(f"{argument}: there is no {key}. Accepted there: {accepted}")
