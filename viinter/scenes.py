@@ -381,7 +381,7 @@ def _camera_centres(file: Path, count: int) -> np.ndarray:
     try:
         with open(file, "rb") as stream:
             poses = np.lib.format.read_array(stream, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # NumPy's header is parsed as Python's literals are, and fails in as many ways
         raise SceneError(f"{file}: {error}; expected a NumPy array of numbers: {remedy}") from error
     if poses.ndim != 2 or poses.shape[1] != 17 or poses.dtype.kind not in "fiu":
         found = f"{poses.dtype} of shape {list(poses.shape)}"
