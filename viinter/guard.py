@@ -131,7 +131,8 @@ class DivergenceGuard(L.Callback):
         )
         self.raise_at = step + self._patience()
         trainer.logger.experiment.add_scalar("run/restarts", len(self.restarts), step)
-        log.warning("%s; back to step %d at %g of the rate", what, self.kept_step, rate)
+        if trainer.is_global_zero:
+            log.warning("%s; back to step %d at %g of the rate", what, self.kept_step, rate)
 
     def _advice(self, module: ViewInterpolator, what: str) -> str:
         cfg = module.cfg
