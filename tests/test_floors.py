@@ -10,8 +10,9 @@ FLOORS = [
     ["config", "files", "image", "video", "codes", "features", "metrics", "fields.field", "fields.paper",
      "fields.fast"],
     ["scenes"],
-    ["data", "module", "views"],
-    ["callbacks", "checkpoints", "guard", "pictures", "page", "runs", "comparisons", "plots", "twin"],
+    ["data", "module", "views", "peers"],
+    ["callbacks", "checkpoints", "guard", "pictures", "step_times", "page", "runs", "comparisons", "evidence", "plots",
+     "twin"],
     ["command", "train", "evaluate", "render", "download", "bench", "report", "stability"],
 ]
 # the few steps within a floor, each from the plainer to the one that uses it
@@ -21,7 +22,8 @@ WITHIN = {
     ("module", "data"), ("checkpoints", "callbacks"), ("train", "command"),
     ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),
-    ("comparisons", "page"), ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
+    ("comparisons", "page"), ("evidence", "comparisons"), ("evidence", "page"), ("evidence", "runs"),
+    ("plots", "evidence"), ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
     ("stability", "command"), ("stability", "train"),
 }  # fmt: skip
 FLOOR = {name: k for k, names in enumerate(FLOORS) for name in names}

@@ -130,6 +130,23 @@ def test_pairs_are_a_sweep_over_folders_and_four_corners_need_four_views(command
     assert (tmp_path / "sweep" / "report" / "pairs_from_view_to_view.png").stat().st_size > 5000
 
 
+def test_error_against_time_compares_two_models_at_several_budgets_with_what_needs_no_training(
+    command_line, archive, tmp_path
+):
+    chosen = ["experiment=error_vs_time", "scene=stanford/knights", f"paths.data={archive}", "seed=0", BLIND]
+    found, done = sweep(command_line, tmp_path, *chosen, "optim.training_seconds=0.2,0.4")
+    assert (found.code, len(done)) == (0, 4), found.err
+    assert [setting(folder, "model.name") for folder in done] == ["paper", "paper", "fast", "fast"]
+    assert command_line("viinter.report", "sweep", cwd=tmp_path).code == 0
+    out = tmp_path / "sweep" / "report"
+    page = (out / "report.md").read_text()
+    for needed in ("not reached", "| knights, 32 x 32 | blend |", "| knights, 32 x 32 | flow |", "start-up", "forward",
+                   "camera poses", "model=fast optim.training_seconds=0.4"):  # fmt: skip
+        assert needed in page
+    for picture in ("error_against_time", "work_and_precision"):
+        assert (out / f"error_vs_time_{picture}.png").stat().st_size > 5000
+
+
 # Going on
 
 

@@ -180,13 +180,14 @@ def every_run(runs: list[Run], keys: list[str]) -> Table:
     for run in runs:
         line = [f"{run.folder.parent.name}/{run.folder.name}", *(str(run.setting(key)) for key in keys)]
         for kind in ("known", "novel"):
-            line += [_number(run.value(kind, number), DIGITS[number]) for number in ("psnr", "ssim")]
+            line += [number(run.value(kind, key), DIGITS[key]) for key in ("psnr", "ssim")]
         facts = run.metrics or {}
-        line += [_number(facts.get("code_length"), 3), str(facts.get("steps", "-"))]
-        line += [_number(facts.get(k), 0) for k in ("training_seconds", "wall_seconds", "peak_memory_mb")]
+        line += [number(facts.get("code_length"), 3), str(facts.get("steps", "-"))]
+        line += [number(facts.get(k), 0) for k in ("training_seconds", "wall_seconds", "peak_memory_mb")]
         rows.append([*line, run.missing or ""])
     return Table("Every run", columns, rows)
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
+    """A number as a cell shows it."""
     return "-" if value is None else f"{value:.{digits}f}"

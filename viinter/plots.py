@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from viinter import image
+from viinter.evidence import BUDGET, curve, methods
 from viinter.pictures import STRIP
 from viinter.runs import Run
 
@@ -90,6 +91,65 @@ def _with_range(axes: Axes, points: list[tuple[float, list[float]]], style: str,
         axes.errorbar([x for x, _ in points], means, [below, above], fmt=style, capsize=3, markersize=4, label=name)
 
 
+def error_curves(runs: list[Run], flat: dict[str, float]) -> Figure:
+    """MSE of probes and known views against training seconds, a line a method: median over seeds, range shaded.
+
+    flat: MSE at the probes of what needs no training, by name.
+    """
+    figure, both = plt.subplots(1, 2, figsize=(11, 4), sharey=True, layout="constrained")
+    for axes, kind in zip(both, ("novel", "known"), strict=True):
+        for name, of in methods(runs).items():
+            if found := curve(of, kind):
+                (line,) = axes.plot(found.seconds, found.median, "o-", markersize=3, label=name)
+                axes.fill_between(found.seconds, found.low, found.high, color=line.get_color(), alpha=0.2, linewidth=0)
+        if kind == "novel":
+            for name, error in flat.items():
+                axes.axhline(error, color="0.3", linestyle=":" if name == "blend" else "--", linewidth=1, label=name)
+        axes.set(xscale="log", yscale="log", xlabel="training seconds", title=f"{kind} views")
+        axes.grid(True, which="both", alpha=0.3)
+    both[0].set_ylabel("mean squared error")
+    if both[0].lines or both[1].lines:
+        both[0].legend(fontsize=6)
+    return _signed(figure, runs)
+
+
+def work_precision(runs: list[Run], flat: dict[str, float]) -> Figure:
+    """Novel PSNR at the end of each budget against training seconds, a line a method; the Pareto front is ringed.
+
+    A point is the mean over seeds, with the range. On the front is what nothing quicker equals. flat: as above, PSNR.
+    """
+    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+    every = []
+    for name, of in methods(runs, budgets=False).items():
+        points = []
+        for budget in dict.fromkeys(tuple(run.setting(key) for key in BUDGET[1:]) for run in of):
+            seeds = [run for run in of if tuple(run.setting(key) for key in BUDGET[1:]) == budget]
+            if values := _values(seeds, "novel"):
+                seconds = [run.metrics["training_seconds"] for run in seeds if run.value("novel", "psnr") is not None]
+                points.append((statistics.fmean(seconds), values))
+        _with_range(axes, sorted(points), "o-", name)
+        every += [(seconds, statistics.fmean(values)) for seconds, values in points]
+    front = pareto(every)
+    if front:
+        axes.plot(*zip(*front, strict=True), "o", markersize=11, fillstyle="none", color="black", label="Pareto front")
+    for name, psnr in flat.items():
+        axes.axhline(psnr, color="0.3", linestyle=":" if name == "blend" else "--", linewidth=1, label=name)
+    axes.set(xscale="log", xlabel="training seconds of the budget", ylabel="novel PSNR, dB")
+    axes.grid(True, which="both", alpha=0.3)
+    if axes.lines:
+        axes.legend(fontsize=6)
+    return _signed(figure, runs)
+
+
+def pareto(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those (seconds, quality) that are better than all that take no longer."""
+    front: list[tuple[float, float]] = []
+    for seconds, quality in sorted(points, key=lambda p: (p[0], -p[1])):
+        if not front or quality > front[-1][1]:
+            front.append((seconds, quality))
+    return front
+
+
 def panel(rows: dict[str, list[Run]], shown: list[int]) -> Figure:
     """Frames between two known views, a row for each setting: whole, then zoomed in at their middle.
 
@@ -124,9 +184,13 @@ def panel(rows: dict[str, list[Run]], shown: list[int]) -> Figure:
 
 
 def _fit(view: Tensor, height: int, width: int) -> Tensor:
-    """`view` [h, w, 3] at `height` x `width`, each pixel kept as a block of one colour."""
-    rows = torch.arange(height) * view.shape[0] // height
-    return view[rows][:, torch.arange(width) * view.shape[1] // width]
+    """`view` [h, w, 3] as large as goes into `height` x `width`, each pixel a block of one colour; white around it."""
+    scale = min(height / view.shape[0], width / view.shape[1])
+    rows, columns = (torch.arange(round(side * scale)) for side in view.shape[:2])
+    fitted = torch.ones(height, width, 3)
+    part = view[(rows / scale).long().clamp_max(view.shape[0] - 1)]
+    fitted[: len(rows), : len(columns)] = part[:, (columns / scale).long().clamp_max(view.shape[1] - 1)]
+    return fitted
 
 
 def _strip(run: Run) -> list[Tensor] | None:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from viinter import command, comparisons, config, page, plots, runs
+from viinter import command, comparisons, config, evidence, page, peers, plots, runs, scenes
 from viinter.comparisons import grouped
 from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.page import Picture, Section, Table
@@ -47,6 +47,7 @@ def report(folders: list[str | Path], out: Path) -> list[Path]:
         of = [run for run in found if run.experiment == experiment]
         title, items = EXPERIMENTS.get(experiment, ("Runs", lambda *_: []))
         section = Section(experiment or "runs", title, items(of, paper))
+        section.items += against_time(of)
         if any(run.evaluation for run in of):
             section.items.append(comparisons.finetuned(of, paper))
         section.items.append(comparisons.every_run(of, varied(of)))
@@ -79,8 +80,51 @@ def varied(of: list[Run]) -> list[str]:
     """The settings in which the runs differ, but for where files lie and what is shown meanwhile."""
     keys = dict.fromkeys(key for run in of for key in run.settings or {})
     values = {key: {str(run.setting(key)) for run in of if run.settings} for key in keys}
+    keys = [key for key in keys if all(key in run.settings for run in of if run.settings)]
     passed_over = ("scene.root", "scene.url", "scene.archive_root", "scene.published.", "paths.", "logging.", "resume")
     return [key for key in keys if len(values[key]) > 1 and not key.startswith(passed_over)]
+
+
+def against_time(of: list[Run]) -> list[Table | Picture | str]:
+    """Error against run time, beside what needs no training."""
+    if not any(run.metrics for run in of):
+        return []
+    named = untrained(of)
+    peer_rows = [[name, peer, _text(found, "psnr"), _text(found, "ssim")] for name, peers_found in named.items()
+                 for peer, found in peers_found.items()]  # fmt: skip
+    # a line in a plot of one scene alone
+    one = next(iter(named.values())) if len(named) == 1 else {}
+    mse, psnr = ({k: f[key] for k, f in one.items() if not isinstance(f, str)} for key in ("mse", "psnr"))
+    curves = Picture("Error against time", lambda: plots.error_curves(of, mse), "Median over seeds, range shaded.")
+    work = Picture("Work and precision", lambda: plots.work_precision(of, psnr), "Each budget had its own schedule.")
+    budgets = {tuple(run.setting(key) for key in evidence.BUDGET[1:]) for run in of}
+    return [
+        curves,
+        *([work] if len(budgets) > 1 else []),
+        evidence.times_to_targets(of),
+        Table("Without training", ["scene", "peer", "novel PSNR", "novel SSIM"], peer_rows,
+              ["`blend`: cross-fade of a probe's known views. `flow`: both warped to it along DIS optical flow."]),
+        evidence.where_time_goes(of),
+        evidence.omitted(of),
+    ]  # fmt: skip
+
+
+def untrained(of: list[Run]) -> dict[str, dict[str, Any]]:
+    """`peers.measure` of every scene that the finished runs have, by name and size; the reason if it cannot be read."""
+    found = {}
+    for run in of:
+        if run.metrics:
+            name = f"{run.metrics['scene']}, {run.metrics['width']} x {run.metrics['height']}"
+            if name not in found:
+                try:
+                    found[name] = peers.measure(scenes.load(config.from_plain(run.metrics["settings"]).scene))
+                except UserError as error:
+                    found[name] = dict.fromkeys(peers.PEERS, str(error))
+    return found
+
+
+def _text(found: dict[str, Any] | str, key: str) -> str:
+    return f"- [{found}]" if isinstance(found, str) else comparisons.number(found[key], comparisons.DIGITS[key])
 
 
 # What the report shows of each experiment: (runs, the paper's numbers) -> items
@@ -150,6 +194,7 @@ EXPERIMENTS: dict[str | None, tuple[str, Callable[[list[Run], dict[str, Any]], l
     "planar": ("Planar light fields (Table 2)", of_scenes("planar")),
     "unstructured": ("Unstructured light fields (Table 2)", of_scenes("unstructured")),
     "pairs": ("Two images (frame interpolation)", pairs),
+    "error_vs_time": ("Error against run time", lambda *_: []),
 }
 
 

@@ -46,6 +46,7 @@ from viinter.guard import DivergenceError, DivergenceGuard
 from viinter.metrics import SSIM_WINDOW
 from viinter.module import ViewInterpolator, checkpoint_file, read_checkpoint
 from viinter.scenes import Scene
+from viinter.step_times import StepTimes
 
 ABOUT = """
 Trains one field and one code for each image of a scene, and draws the views between them.
@@ -78,6 +79,7 @@ def train(
             and the last checkpoint is whole; `DivergenceError`: the run diverged again and again.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when the checkpoint has been written; its message says how to go on.
     """
+    times = StepTimes()
     config.check(cfg)
     again = f"python -m viinter.train resume={run_dir}"
     if not resume and (run_dir / "checkpoints").exists():
@@ -122,6 +124,7 @@ def train(
             max_epochs=-1,
             logger=TensorBoardLogger(run_dir, name="", version="", default_hp_metric=False),
             callbacks=callbacks,
+            profiler=times,
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -137,7 +140,7 @@ def train(
             return {}
         module.eval()
         metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
-        metrics |= {"restarts": len(guard.restarts), "restarted": guard.restarts}
+        metrics |= {"seconds": times.seconds(), "restarts": len(guard.restarts), "restarted": guard.restarts}
         write_json(run_dir / "metrics.json", metrics)
         (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
         if cfg.logging.pictures:
