@@ -70,6 +70,14 @@ def test_the_work_precision_diagram_has_a_point_for_each_budget_and_a_line_for_w
     plots.plt.close(figure)
 
 
+def test_what_was_left_out_is_told_once_with_what_it_saved():
+    runs = [run_with([(9, 0.1)], f"seed={k}") for k in range(2)]
+    for k, run in enumerate(runs):
+        known = {"part": "a", "reason": "r", "seconds": 1.0 + k, "megabytes": 0.0, "how": "timed"}
+        run.metrics |= {"scene": "s", "omitted": [known, {**known, "part": "b", "seconds": None, "megabytes": None}]}
+    assert evidence.omitted(runs).rows == [["s", "a", "r", "1.5", "0.0", "timed"], ["s", "b", "r", "-", "-", "timed"]]
+
+
 # Where the time of a run goes
 
 

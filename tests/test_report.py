@@ -113,7 +113,7 @@ def test_a_deleted_and_a_failed_job_keep_their_places_with_the_reason(command_li
 def test_the_html_is_one_file_and_the_tables_are_there_as_csv_too(holed, tmp_path):
     files = report.report([holed], tmp_path)
     text = (tmp_path / "report.html").read_text()
-    assert text.count("data:image/png;base64,") == 2
+    assert text.count("data:image/png;base64,") == 3
     assert not re.findall(r'(?:src|href)="(?!data:)', text)
     for needed in ("torch", "lightning", "32-true", "seed 0"):
         assert needed in report.plots.conditions(runs.read([holed]))

@@ -99,7 +99,14 @@ def where_time_goes(runs: list[Run]) -> Table:
 
 
 def omitted(runs: list[Run]) -> Table:
-    """What the runs' scenes did not need, and why."""
-    done = [run.metrics for run in runs if run.metrics]
-    left = {(metrics["scene"], o["part"], o["reason"]) for metrics in done for o in metrics["omitted"]}
-    return Table("Left out", ["scene", "part", "reason"], [list(line) for line in sorted(left)])
+    """What the runs' scenes did not need, why, and what that saved: mean over the runs, or how it can be measured."""
+    found: dict[tuple[str, str, str, str], list[dict]] = defaultdict(list)
+    for metrics in (run.metrics for run in runs if run.metrics):
+        for left in metrics["omitted"]:
+            found[metrics["scene"], left["part"], left["reason"], left.get("how", "")].append(left)
+    rows = []
+    for (scene, part, reason, how), each in found.items():
+        saved = [[left[key] for left in each if left.get(key) is not None] for key in ("seconds", "megabytes")]
+        numbers = [f"{statistics.fmean(values):.1f}" if values else "-" for values in saved]
+        rows.append([scene, part, reason, *numbers, how])
+    return Table("Left out", ["scene", "part", "reason", "seconds saved", "MB saved", "how measured"], rows)
