@@ -206,6 +206,19 @@ def test_known_views_and_probes_measure_as_at_the_end_of_training(run, evaluated
     assert found["novel_quarters"] == trained["novel_quarters"]  # there are none
 
 
+@pytest.mark.parametrize(
+    ("model", "precision"), [("paper", "64-true"), ("paper", "bf16-true"), ("paper", "bf16-mixed"), ("fast", "64-true")]
+)
+def test_a_run_of_another_precision_measures_as_at_the_end_of_training(make_config, tmp_path, model, precision):
+    cfg = make_config(**{"model": model, "trainer.precision": precision})
+    trained = train(cfg, tmp_path)
+    keep_config(cfg, tmp_path)
+    found = evaluate(EvaluateConfig(run=str(tmp_path), finetune_steps=2))
+    assert found["known"] == trained["known"]
+    assert found["novel"] == trained["novel"]
+    assert found["finetuned"]["mse"] < found["novel"]["mse"]
+
+
 def test_what_was_measured_is_written_beside_the_metrics(run, evaluated):
     assert json.loads((run / "evaluation.json").read_text()) == evaluated[0]
 

@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from viinter import command, config, metrics, scenes
 from viinter.codes import mix
-from viinter.config import ConfigError, EvaluateConfig
+from viinter.config import ConfigError, EvaluateConfig, TrainConfig
 from viinter.data import PixelStore
-from viinter.module import load, run_device
+from viinter.module import ViewInterpolator, load, run_device
 from viinter.scenes import Probe
 from viinter.train import about, describe, write_json
 from viinter.views import draw, measure
@@ -53,7 +53,7 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
         raise ConfigError(f"{trained.scene.root} no longer holds the known views that {cfg.run} was trained on")
     console.print(describe(scene))
     codes = model.codes.weight.detach()
-    with console.status("measuring every view") as status:
+    with console.status("measuring every view") as status, as_trained(model, trained):
         found: dict[str, Any] = measure(
             model.field, codes, scene, None, cfg.chunk_pixels,
             lambda kind, k, *_: status.update(f"measuring {kind} {k + 1}"),
@@ -62,7 +62,8 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
         errors = {}
         for probe in track(scene.probes["novel"], "finetuning codes", console=console):
             z = finetune(model.field, codes, probe, cfg)
-            image = draw(model.field, z, scene.height, scene.width, cfg.chunk_pixels)
+            with as_trained(model, trained):
+                image = draw(model.field, z, scene.height, scene.width, cfg.chunk_pixels)
             errors[probe.name] = metrics.compare(image, probe.target.to(image.device))
         found["finetuned"] = metrics.summary(errors)
     write_json(Path(cfg.run) / "evaluation.json", found)
@@ -74,13 +75,21 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
     return found
 
 
+def as_trained(model: ViewInterpolator, trained: TrainConfig) -> torch.autocast:
+    """The mixed precision that training measured in, for a run that had one."""
+    name = trained.trainer.precision
+    kind = torch.bfloat16 if name.startswith("bf16") else torch.float16
+    return torch.autocast(model.device.type, kind, enabled="16" in name and model.dtype == torch.float32)
+
+
 def finetune(field: nn.Module, codes: Tensor, probe: Probe, cfg: EvaluateConfig) -> Tensor:
     """The code [M] that shows `probe.target` best, found by Adam from the probe's mix; `field` is not touched.
 
     The code is not held on the sphere: a mix lies inside it. Its step is measured against the code book's own scale,
     which the norm's order changes by orders of magnitude, and falls to zero along a cosine.
     """
-    z = mix(codes, probe.mix).requires_grad_()
+    z = mix(codes, probe.mix)
+    z = z.to(torch.promote_types(z.dtype, torch.float32)).requires_grad_()  # steps are finer than 16 bits
     store = PixelStore(probe.target[None], cfg.finetune_pixels, config.PixelsFrom.one_view, 0, codes.device)
     first = cfg.finetune_lr * codes.square().mean().sqrt().item()
     optimizer = torch.optim.Adam([z], lr=first)

@@ -107,7 +107,7 @@ def _older(file: Path) -> str:
 
 
 def load(run: str | Path, device: torch.device | str = "cpu") -> ViewInterpolator:
-    """The trained model of the run folder `run`, in evaluation mode on `device`.
+    """The trained model of the run folder `run`, in evaluation mode on `device`, its weights of the type they had.
 
     Raises ConfigError if there is no checkpoint or it is not one of ours.
     """
@@ -120,6 +120,7 @@ def load(run: str | Path, device: torch.device | str = "cpu") -> ViewInterpolato
         model = ViewInterpolator(
             from_plain(checkpoint["config"]), len(checkpoint["about"]["names"]), checkpoint["about"]
         )
+        model.to(checkpoint["state_dict"]["codes.weight"].dtype)  # trainer.precision may be 64-true or bf16-true
         model.load_state_dict(checkpoint["state_dict"])
     except (LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(f"{file} is not a checkpoint of this version: {error}") from error

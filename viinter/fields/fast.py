@@ -123,7 +123,7 @@ class FastField(Field):
         would be wrong by parts of a pixel, and there are no matrix products that would gain.
         """
         with torch.autocast(xy.device.type, enabled=False):
-            return self._colours(xy, z.to(xy.dtype))
+            return self._colours(xy.to(self.shift.dtype), z.to(self.shift.dtype))
 
     def _colours(self, xy: Tensor, z: Tensor) -> Tensor:
         place = self.place(z)
@@ -160,7 +160,7 @@ class FastField(Field):
             for rows in torch.arange(height, device=views.device).split(max(1, 65_536 // width)):
                 xy = torch.stack(torch.meshgrid(x, y[rows], indexing="xy"), -1).flatten(0, 1)
                 drawn = self(xy[None], codes[k : k + 1])[0].view(len(rows), width, 3)
-                self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).half()
+                self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).to(self.remainder.dtype)
         self.places.copy_(self.place(codes))
         apart = torch.cdist(self.places, self.places).fill_diagonal_(math.inf).amin(1)
         # two views at one place would reach nowhere; all of them at one place still share their remainders there
