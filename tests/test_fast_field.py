@@ -14,7 +14,7 @@ M = 8
 
 def make(height: int = 64, width: int = 64, views: int = 2, **changes) -> FastField:
     torch.manual_seed(0)
-    settings = {"layers": 3, "motion": 6, "margin": 1.1, "sharpness": 5.0, "entropy": 1e-3, "disparity_scale": 4,
+    settings = {"layers": 3, "motion": 6, "margin": 1.1, "sharpness": 5.0, "entropy": 1e-3,
                 "remainder": True} | changes  # fmt: skip
     return FastField(M, views, height, width, **settings)
 
@@ -47,8 +47,8 @@ def test_norm_and_radius_of_the_codes_do_not_matter():
 @pytest.mark.parametrize(("height", "width", "levels"), [(64, 64, 2), (256, 300, 4), (32, 32, 1), (5, 7, 1), (1, 9, 1)])
 def test_the_coarsest_level_has_about_32_pixels_and_the_finest_those_of_a_view(height, width, levels):
     field = make(height, width)
-    assert len(field.levels) == levels
-    assert field.levels[-1].shape[-2:] == (max(2, round(1.1 * height)), max(2, round(1.1 * width)))
+    assert len(field.colours) == levels
+    assert field.colours[-1].shape[-2:] == (max(2, round(1.1 * height)), max(2, round(1.1 * width)))
     assert torch.isfinite(draw(field, torch.randn(M), height, width)).all()
 
 
@@ -60,8 +60,8 @@ def test_levels_go_from_coarse_to_fine_and_the_finest_has_seven_tenths_of_the_bu
         field.at(k / 1000)
         seen.append(field.level)
     assert seen == sorted(seen)
-    assert set(seen) == set(range(len(field.levels)))
-    finest = seen.count(len(field.levels) - 1) / 1001
+    assert set(seen) == set(range(len(field.colours)))
+    finest = seen.count(len(field.colours) - 1) / 1001
     assert finest == pytest.approx(1.0 if size == 32 else 0.7, abs=0.01)
 
 
@@ -73,7 +73,7 @@ def test_only_the_level_in_training_gets_a_gradient_and_whatever_moves_slows_dow
         field.at(progress)
         (field(xy, z).square().mean() + field.penalty()).backward()
         assert field.level == level
-        assert [k for k, texture in enumerate(field.levels) if texture.grad is not None] == [level]
+        assert [k for k, texture in enumerate(field.colours) if texture.grad is not None] == [level]
         assert field.rates()[2:] == [0.5**level] * 3
 
 
@@ -93,7 +93,7 @@ def test_the_penalty_is_greatest_undecided_and_nothing_once_each_pixel_has_one_l
     field(xy, z)
     assert field.penalty().item() == pytest.approx(1 - 1 / 4, abs=1e-6)
     with torch.no_grad():
-        field.levels[-1][2, 3] = 10.0
+        field.weights[-1][2] = 10.0
     field(xy, z)
     assert field.penalty().item() == pytest.approx(0, abs=1e-6)
 

@@ -149,7 +149,6 @@ class FastModel(ModelConfig):
     margin: float = setting(1.1, "size of a texture in views, for what moves in from outside")
     sharpness: float = setting(5.0, "scale of the layers' weights in their softmax")
     entropy: float = setting(1e-3, "weight of the penalty on pixels that mix layers")
-    disparity_scale: int = setting(4, "pixels to an entry of the disparity maps")
     remainder: bool = setting(True, "keep what the layers leave over of each known view, and share it out")
 
 
@@ -331,7 +330,7 @@ def check(cfg: TrainConfig) -> None:
         "evaluation.chunk_pixels": cfg.evaluation.chunk_pixels, "logging.every_seconds": cfg.logging.every_seconds,
         "checkpoint.every_seconds": cfg.checkpoint.every_seconds,
     }  # fmt: skip
-    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "margin", "sharpness", "disparity_scale"):
+    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "margin", "sharpness"):
         if hasattr(cfg.model, key):
             positive[f"model.{key}"] = getattr(cfg.model, key)
     for key, value in positive.items():

@@ -41,7 +41,7 @@ def model_and_batch(cfg: TrainConfig) -> tuple[ViewInterpolator, PixelBatch]:
         if isinstance(model.field, FastField):
             model.field.at(1.0)
             with torch.no_grad():
-                for values in (*model.field.levels, model.field.delta, model.field.bend):
+                for values in (*model.field.colours, *model.field.weights, model.field.delta, model.field.bend):
                     values.add_(0.05 * torch.randn_like(values))
         batch = PixelBatch(
             torch.arange(VIEWS), torch.rand(VIEWS, PIXELS, 2) * 2 - 1, torch.rand(VIEWS, PIXELS, 3)

@@ -1,8 +1,8 @@
 """The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
 
 Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `L` layers, `K` motion
-polynomials. A layer has a texture [4, h, w] (rgb and a weight) at about the resolution of a view, and a disparity
-d_l(u) = d_l + delta_l(u) with a coarser map delta_l. Under the code z the pixel xy reads layer l at
+polynomials. A layer has colours [3, h, w] at about the resolution of a view, weights and disparities. Under the code z
+the pixel xy reads layer l at
 
     u_l = xy + a(xy, z) + d_l(u) b(xy, z),      a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
 
@@ -11,6 +11,9 @@ motion (Longuet-Higgins and Prazdny 1980): `a` the part that a rotation gives ev
 translation gives in proportion to inverse depth. Nothing is told to it: a_k(z), b_k(z), the disparities and the
 textures are all learned from the pixels. Since the motion is linear in z, a mix of codes moves each surface half way
 where a cross-fade would show it twice.
+
+The disparity d_l(u) = d_l + delta_l(u) has a smooth map delta_l. The weights are coarser than the colours too: where a
+surface ends is a line, and pixels that go over to another surface in each view would learn known views by heart.
 
 The colour is the mean of the layers' colours, weighted by a softmax of their weights: not an alpha compositing, which
 trained more slowly and worse. Layered textures read through a homography are the multi-plane images of Zhou et al.
@@ -39,20 +42,22 @@ REACH = 0.7  # how far a known view's remainder reaches, in distances to the vie
 class FastField(Field):
     """F(xy | z) -> rgb from `layers` textures for `views` known views of `height` x `width`.
 
-    Coarse to fine: textures are sums of levels, each twice as fine as the one before. `at(progress)` chooses the level
-    in training; those before it are kept as they are, those after it do not take part. See `config.FastModel` for the
-    other arguments.
+    Coarse to fine: colours and weights are sums of levels, each twice as fine as the one before. `at(progress)` chooses
+    the level in training; those before it are kept as they are, those after it do not take part. A level's weights have
+    half the size of its colours; the finest level has none of its own and trains those of the level before. See
+    `config.FastModel` for the other arguments.
     """
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, motion: int, margin: float,
-                 sharpness: float, entropy: float, disparity_scale: int, remainder: bool) -> None:  # fmt: skip
+                 sharpness: float, entropy: float, remainder: bool) -> None:  # fmt: skip
         super().__init__()
         self.margin, self.sharpness, self.entropy, self.motion = margin, sharpness, entropy, motion
         count = max(0, math.ceil(math.log2(min(height, width) / COARSEST))) + 1
         sizes = [(round(height * margin / 2**k), round(width * margin / 2**k)) for k in reversed(range(count))]
-        self.levels = nn.ParameterList(torch.zeros(layers, 4, max(2, h), max(2, w)) for h, w in sizes)
-        size = [max(4, round(s / disparity_scale)) for s in sizes[-1]]
-        self.delta = nn.Parameter(torch.zeros(layers, 1, *size))
+        self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
+        halves = [(max(4, h // 2), max(4, w // 2)) for h, w in sizes]
+        self.weights = nn.ParameterList(torch.zeros(layers, 1, *half) for half in halves[: max(1, count - 1)])
+        self.delta = nn.Parameter(torch.zeros(layers, 1, *halves[max(0, count - 2)]))
         self.disparity = nn.Parameter(torch.linspace(-1, 1, layers) if layers > 1 else torch.zeros(1))
         self.shift = nn.Parameter(0.02 * torch.randn(4, code_dim) / math.sqrt(code_dim))
         self.bend = nn.Parameter(torch.zeros(4 * (motion - 1), code_dim))
@@ -73,7 +78,7 @@ class FastField(Field):
     def parameter_groups(self, codes: nn.Parameter) -> list[dict[str, Any]]:
         """Textures, disparity maps, and three groups that move: what is far from 1 in `share` was found by trial."""
         return [
-            {"params": list(self.levels), "share": 1.0},
+            {"params": [*self.colours, *self.weights], "share": 1.0},
             {"params": [self.delta], "share": 0.5},
             {"params": [self.shift, self.disparity], "share": 0.1},
             {"params": [self.bend], "share": 0.025},
@@ -92,19 +97,15 @@ class FastField(Field):
         faded in over the finest level's first part: a decision made before the motion is known is often wrong.
         """
         self.finished.fill_(False)
-        count = len(self.levels)
+        count = len(self.colours)
         coarse = count - 2
         ends = [0.12 * (k + 1) / coarse for k in range(coarse)] + [0.30, 1.0]
         self.level = next((k for k, end in enumerate(ends[-count:]) if progress < end), count - 1)
         self.decision = min(max((progress - 0.3) / 0.3, 0.0), 1.0)
 
-    def textures(self) -> Tensor:
-        """The textures [L, 4, h, w] at the level in training."""
-        total = self.levels[0] if self.level == 0 else self.levels[0].detach()
-        for k in range(1, self.level + 1):
-            own = self.levels[k] if k == self.level else self.levels[k].detach()
-            total = F.interpolate(total, size=own.shape[-2:], mode="bilinear", align_corners=True) + own
-        return total
+    def textures(self) -> tuple[Tensor, Tensor]:
+        """Colours [L, 3, h, w] and weights [L, 1, h', w'] at the level in training."""
+        return pyramid(self.colours[: self.level + 1]), pyramid(self.weights[: self.level + 1])
 
     def place(self, z: Tensor) -> Tensor:
         """The motion's coefficients [V, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
@@ -130,10 +131,11 @@ class FastField(Field):
         a, b = self.carry(xy, place).split(2, -1)
         u = (xy / self.margin + a)[None] + self.disparity[:, None, None, None] * b[None]
         disparity = self.disparity[:, None, None]
-        if self.level >= min(2, len(self.levels) - 1):
+        if self.level >= min(2, len(self.colours) - 1):
             delta = sample(self.delta, u)[:, 0]
             u, disparity = u + delta[..., None] * b[None], disparity + delta
-        read = sample(self.textures(), u)
+        colours, weights = self.textures()
+        read = sample(torch.cat([colours, stretch(weights, colours)], 1), u)
         weight = torch.softmax(self.sharpness * read[:, 3], 0)
         if self.training and torch.is_grad_enabled():
             self.chosen = weight
@@ -189,6 +191,22 @@ class FastField(Field):
             read = sample(self.remainder[view].to(there.dtype), there[:, None])[:, :, 0]
             total = total + share[:, None, None] * read.movedim(1, -1)
         return total
+
+
+def pyramid(levels: nn.ParameterList) -> Tensor:
+    """The sum of the maps [N, C, h, w], at the size of the last, which alone is trained."""
+    *before, last = levels
+    if not before:
+        return last
+    total = before[0].detach()
+    for own in before[1:]:
+        total = stretch(total, own) + own.detach()
+    return stretch(total, last) + last
+
+
+def stretch(maps: Tensor, like: Tensor) -> Tensor:
+    """Maps [N, C, h, w] brought to the size of `like` [..., h', w']; corner pixels stay at the corners."""
+    return F.interpolate(maps, size=like.shape[-2:], mode="bilinear", align_corners=True)
 
 
 def sample(maps: Tensor, u: Tensor) -> Tensor:
