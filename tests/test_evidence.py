@@ -31,7 +31,7 @@ def test_methods_are_what_was_asked_beside_seed_and_budget():
     assert {name: len(of) for name, of in evidence.methods(runs, budgets=False).items()} == {
         "model=paper": 4, "model=fast": 4,
     }  # fmt: skip
-    assert list(evidence.methods(runs))[0] == "model=paper optim.training_seconds=5"
+    assert next(iter(evidence.methods(runs))) == "model=paper optim.training_seconds=5"
     assert list(evidence.methods(runs[:1])) == ["s, model=paper"]
 
 
