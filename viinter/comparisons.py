@@ -95,9 +95,9 @@ def across(title: str, key: str, runs: list[Run], paper: dict[str, Any]) -> Tabl
 
 def lengths(runs: list[Run], kind: str) -> Table:
     """PSNR of `kind` for every p (rows) at every Euclidean length (columns)."""
-    columns = grouped(runs, "codes.length")
+    columns = sorted(grouped(runs, "codes.length"), key=lambda v: float(v.replace("None", "0")))
     rows = []
-    for p, of in grouped(runs, "codes.p").items():
+    for p, of in grouped(runs, "codes.p", P_ORDER).items():
         rows.append([f"p = {p}"] + [cell([r for r in of if str(r.setting("codes.length")) == v], kind, "psnr")
                                     for v in columns])  # fmt: skip
     notes = [f"Here: {marked(runs)}. Mean over seeds, and the range. The paper has no such table."]

@@ -104,7 +104,7 @@ def against_time(of: list[Run]) -> list[Table | Picture | str]:
         evidence.times_to_targets(of),
         Table("Without training", ["scene", "peer", "novel PSNR", "novel SSIM"], peer_rows,
               ["`blend`: cross-fade of a probe's known views. `flow`: both warped to it along DIS optical flow."]),
-        evidence.where_time_goes(of),
+        *([evidence.where_time_goes(of)] if any("seconds" in (run.metrics or {}) for run in of) else []),
         evidence.omitted(of),
     ]  # fmt: skip
 
