@@ -1,6 +1,6 @@
 """Any bytes and any settings are accepted or answered with a UserError, never with another one.
 
-Image files have such tests of their own in `test_image.py`.
+Image files have such tests of their own in `test_image.py`, and one that is guided here.
 """
 
 import contextlib
@@ -10,6 +10,7 @@ import io
 import numpy as np
 import pytest
 import torch
+from conftest import typed
 from hypothesis import HealthCheck, example, given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
@@ -17,6 +18,15 @@ from hypothesis import strategies as st
 from viinter import config, scenes
 from viinter.config import UserError
 from viinter.module import read_checkpoint
+
+
+def test_mutated_pictures_are_read_or_refused(tmp_path):
+    pytest.importorskip("atheris", reason="atheris has wheels for Linux on x86_64 and Python 3.11 to 3.13")
+    (tmp_path / "seeds").mkdir()
+    found = typed("-m", "tests.fuzz_images", "seeds", "-runs=3000", "-seed=1", cwd=tmp_path)
+    assert found.returncode == 0, found.stderr
+    assert "Done 3000 runs" in found.stderr
+
 
 quick = effort(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

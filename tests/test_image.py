@@ -458,6 +458,15 @@ def test_too_many_pixels_are_refused_from_the_header(tmp_path, monkeypatch):
             door(tmp_path / "a.exr")
 
 
+def test_a_reason_that_quotes_bytes_is_shown(tmp_path):
+    """OpenEXR's message holds the name of an attribute's type as it is in the file, here no UTF-8."""
+    image.write(tmp_path / "a.exr", torch.rand(5, 4, 3), 16)
+    data = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(data.replace(b"lineOrder\0lineOrder", b"lineOrder\0li\xeeeOrder"))
+    with pytest.raises(image.ImageError, match=r"Invalid type 'li\\xeeeOrder'; expected"):
+        image.read(tmp_path / "a.exr")
+
+
 @quick
 @given(
     st.binary(max_size=60),

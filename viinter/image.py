@@ -10,6 +10,7 @@ by `a` (PNG), *associated* where it is (EXR). `name` is a path as `str`, the way
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -227,7 +228,7 @@ def _open(path: str | os.PathLike) -> tuple[str, oiio.ImageInput]:
     hints.attribute("oiio:UnassociatedAlpha", 1)
     file = oiio.ImageInput.open(name, hints)
     if file is None:
-        reason = _one_line(oiio.geterror())
+        reason = _reason(oiio)
         raise ImageError(f"{name}: {reason}; {wanted}, whole, in one of {', '.join(_FORMATS)}")
     try:
         spec, kind = file.spec(), file.format_name()
@@ -283,11 +284,12 @@ def _refuse_more(name: str, file: oiio.ImageInput) -> None:
         raise ImageError(f"{name}: holds several images (animation, pages, layers or parts); expected one")
 
 
-def _reason(file: oiio.ImageInput | oiio.ImageOutput) -> str:
-    return _one_line(file.geterror())
-
-
-def _one_line(message: str) -> str:
+def _reason(library: Any) -> str:
+    """What OpenImageIO, or a file of it, gives as its last error."""
+    try:
+        message = library.geterror()
+    except UnicodeDecodeError as error:  # it may quote the file's own bytes
+        message = error.object.decode(errors="backslashreplace")
     return " / ".join(message.split("\n")) or "OpenImageIO gives no reason"
 
 
