@@ -32,7 +32,9 @@ from conftest import (
     draw_planar,
     draw_studio,
     keep_config,
+    same,
     settings,
+    without_times,
 )
 from PIL import Image
 
@@ -432,6 +434,21 @@ def test_a_read_only_output_folder_is_named(command_line, tmp_path):
         assert re.search(r"disk/run.*: Read-only file system; expected a place that can be written", found.err)
         assert "Traceback" not in found.err
         assert not list((tmp_path / "disk").iterdir())
+
+
+def test_two_runs_begun_at_once_have_a_whole_folder_each(command_line, tmp_path):
+    draw_folder(tmp_path / "scene")
+    arguments = [*FEW, "scene=folder", "scene.root=scene", "logging.progress=false", "logging.pictures=false"]
+    found = command_line("tests.two_trains", *arguments, cwd=tmp_path)
+    assert (found.code, found.err) == (0, "")
+    folders = sorted((tmp_path / "outputs" / "folder" / "paper").iterdir())
+    assert len(folders) == 2
+    files = [{file.name.partition(".out")[0] for file in folder.rglob("*") if file.is_file()} for folder in folders]
+    assert files[0] == files[1] >= {"config.yaml", "last.ckpt", "metrics.json", "error_vs_time.csv", "events"}
+    assert same(*[checkpoint_of(folder)["state_dict"] for folder in folders])
+    metrics = [json.loads((folder / "metrics.json").read_text()) for folder in folders]
+    assert without_times(metrics[0]) == without_times(metrics[1])
+    assert metrics[0]["steps"] == 30
 
 
 def write_page() -> None:
