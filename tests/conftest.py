@@ -185,6 +185,8 @@ def without_times(found):
 
 SERVER = """
 import json, os, signal, sys, warnings
+if "coverage" in sys.modules:
+    sys.modules["coverage"].Coverage.current().stop()  # it begins in each child, by its own patch of fork
 warnings.simplefilter("ignore")
 import av, hydra, lightning.pytorch.loggers, matplotlib, OpenImageIO, PIL.Image, rich.progress, rich.table
 import torch.utils.tensorboard, torchmetrics.functional.image
