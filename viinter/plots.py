@@ -108,8 +108,8 @@ def error_curves(runs: list[Run], flat: dict[str, float]) -> Figure:
         axes.set(xscale="log", yscale="log", xlabel="training seconds", title=f"{kind} views")
         axes.grid(True, which="both", alpha=0.3)
     both[0].set_ylabel("mean squared error")
-    if both[0].lines or both[1].lines:
-        both[0].legend(fontsize=6)
+    if named := [axes for axes in both if axes.lines]:  # a scene without probes has known views alone
+        named[0].legend(fontsize=6)
     return _signed(figure, runs)
 
 
