@@ -83,7 +83,7 @@ def test_what_was_left_out_is_told_once_with_what_it_saved():
 
 def test_the_parts_of_a_run_add_up_to_all_of_it(make_config, tmp_path, fake_tower):
     begin = time.perf_counter()
-    values = {**WITH_TOWER, "optim.steps": 8, "evaluation.first_seconds": 0.001, "evaluation.max_share": 100.0}
+    values = {**WITH_TOWER, "optim.steps": 40, "evaluation.first_seconds": 0.001, "evaluation.max_share": 100.0}
     seconds = train(make_config("pair", **values), tmp_path)["seconds"]
     took = time.perf_counter() - begin
     parts = "start-up,sampling,forward,backward,optimiser,interpolation step,projection,evaluation,logging,rest"

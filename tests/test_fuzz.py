@@ -28,7 +28,9 @@ def test_mutated_pictures_are_read_or_refused(tmp_path):
     assert "Done 3000 runs" in found.stderr
 
 
-quick = effort(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = effort(
+    max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 def accepted_or_answered(use):
@@ -50,6 +52,8 @@ PLAIN = config.plain(config.TrainConfig(
 @quick
 @given(st.dictionaries(st.sampled_from(KEYS), VALUES, min_size=1, max_size=3))
 @example({"model.width": 0})
+@example({"scene.name": "${0}"})
+@example({"scene.name": "${"})
 def test_any_settings_are_run_or_refused(values):
     plain = copy.deepcopy(PLAIN)
     for key, value in values.items():
@@ -98,6 +102,7 @@ CHECKPOINT = {"config": {}, "about": {}, "state_dict": {"a": torch.zeros(2)}, "g
 
 @quick
 @given(damaged(saved(lambda file, value: torch.save(value, file), CHECKPOINT)))
+@example(data=b"X")
 @pytest.mark.filterwarnings("ignore")
 def test_any_bytes_are_a_checkpoint_or_refused(tmp_path, data):
     file = tmp_path / "last.ckpt"

@@ -405,16 +405,17 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def from_plain(values: dict[str, Any] | DictConfig, overrides: list[str] = ()) -> TrainConfig:
     """The TrainConfig of a finished run, from `plain` values or its `.hydra/config.yaml`, with `a.b=c` overrides."""
-    values = OmegaConf.create(values)
-    name = values.get("model", {}).get("name")
-    if name not in MODELS:
-        raise ConfigError(f"model.name={name}: expected one of {', '.join(sorted(MODELS))}")
-    schema = OmegaConf.structured(TrainConfig(model=MODELS[name]()))
     try:
-        merged = OmegaConf.merge(schema, values, OmegaConf.from_dotlist(list(overrides)))
-    except Exception as error:  # omegaconf's own message names the key and the type
+        values = OmegaConf.create(values)
+        name = values.get("model", {}).get("name")
+        if name not in MODELS:
+            raise ConfigError(f"model.name={name}: expected one of {', '.join(sorted(MODELS))}")
+        schema = OmegaConf.structured(TrainConfig(model=MODELS[name]()))
+        return typed(OmegaConf.merge(schema, values, OmegaConf.from_dotlist(list(overrides))), TrainConfig)
+    except UserError:
+        raise
+    except Exception as error:  # omegaconf's own message names the key and the type, or the broken ${...}
         raise ConfigError(str(error)) from error
-    return typed(merged, TrainConfig)
 
 
 def read_run(run: str | Path, overrides: list[str] = ()) -> TrainConfig:

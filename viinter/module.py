@@ -6,6 +6,7 @@ Notation: `n` known views, `M` the length of a code; rgb in [0, 1].
 from __future__ import annotations
 
 import pickle
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
         reason = "another program's"
     except pickle.UnpicklingError:  # PyTorch's own words advise to run what the file holds
         reason = "it holds something other than plain values and tensors"
-    except (OSError, EOFError, RuntimeError, ValueError, TypeError, LookupError) as error:
+    except (OSError, EOFError, RuntimeError, ValueError, TypeError, LookupError, struct.error) as error:
         reason = f"truncated or damaged, {error or type(error).__name__}".partition("\n")[0]
     raise ConfigError(f"{file} is not a whole checkpoint of this version: {reason}.{_older(file)}")
 
