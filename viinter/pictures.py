@@ -14,10 +14,12 @@ from torch import Tensor, nn
 
 from viinter import image, video
 from viinter.codes import path
+from viinter.metrics import psnr
 from viinter.views import draw
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import FixedLocator, NullLocator
 
 STRIP = 5
 
@@ -46,14 +48,11 @@ def plot_error(file: Path, rows: list[dict[str, Any]], title: str) -> None:
     axes.grid(True, which="both", alpha=0.3)
     if axes.lines:
         axes.legend()
-        decibel = axes.secondary_yaxis("right", functions=(lambda m: -10 * _log10(m), lambda d: 10 ** (-d / 10)))
-        decibel.set_ylabel("dB of that mean")
-        decibel.set_yscale("linear")
+        # a secondary axis with a function that falls would be labelled upside down (matplotlib 3.11)
+        right = axes.secondary_yaxis("right")
+        right.yaxis.set_major_locator(FixedLocator([10 ** (-d / 10) for d in range(0, 121, 5)]))
+        right.yaxis.set_major_formatter(lambda mse, _: f"{psnr(mse):.0f}")
+        right.yaxis.set_minor_locator(NullLocator())
+        right.set_ylabel("dB of that mean")
     figure.savefig(file, dpi=130)
     plt.close(figure)
-
-
-def _log10(values: Any) -> Any:
-    import numpy as np
-
-    return np.log10(np.maximum(values, 1e-12))
