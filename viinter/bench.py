@@ -165,21 +165,24 @@ def alpha(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
 
 def one_run(cfg: TrainConfig) -> dict[str, float]:
     """Time and memory of one training, to be called in a process of its own: its peak memory is then the run's."""
-    begin, watch = time.perf_counter(), StepTimes()
+    watch = StepSeconds()
     with tempfile.TemporaryDirectory() as folder:
         found = train(cfg, Path(folder), more_callbacks=[watch])
-    return {"seconds a step": statistics.mean(watch.seconds[WARM_UP:]),
-            "seconds before the first step": watch.started - begin, "peak MB": found["peak_memory_mb"]}  # fmt: skip
+    return {
+        "seconds a step": statistics.mean(watch.seconds[WARM_UP:]),
+        "seconds before the first step": found["seconds"]["start-up"],
+        "peak MB": found["peak_memory_mb"],
+    }
 
 
-class StepTimes(L.Callback):
+class StepSeconds(L.Callback):
     """Seconds from the end of a step to that of the next."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
 
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
-        self.started = self.since = time.perf_counter()
+        self.since = time.perf_counter()
 
     def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
         now = time.perf_counter()

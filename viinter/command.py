@@ -30,6 +30,7 @@ from viinter.config import MODELS, REPOSITORY, ConfigError, TrainConfig, UserErr
 from viinter.files import failure_noted
 
 CONF = REPOSITORY / "conf"
+GROUPS = ("scene", "model", "scale", "tower", "experiment")  # folders of `conf` that a user chooses from
 
 
 def register(schema: type, name: str) -> None:
@@ -65,7 +66,7 @@ def show_help(schema: Any, module: str, about: str) -> None:
     console = Console(width=max(100, min(Console().width, 140)), soft_wrap=False)
     console.print(about.strip(), markup=False, highlight=False, soft_wrap=True)
     if hasattr(schema, "scene"):
-        for group in ("scene", "model", "scale", "tower", "experiment") if hasattr(schema, "model") else ("scene",):
+        for group in GROUPS if hasattr(schema, "model") else GROUPS[:1]:
             if choices(group):
                 console.print(f"\n{group}= one of: {', '.join(choices(group))}", markup=False, highlight=False)
     table = Table(box=None, header_style="bold", padding=(0, 1))
@@ -94,7 +95,7 @@ def check_keys(schema: type, arguments: list[str]) -> None:
         key, equals, value = argument.partition("=")
         if not equals or key.startswith(("-", "+", "~", "hydra")):
             continue
-        known = choices(key) if key in ("scene", "model", "scale", "tower", "experiment") else []
+        known = choices(key) if key in GROUPS else []
         if known and not set(",(") & set(value) and value not in [*known, "null"]:
             raise ConfigError(f"{argument}: there is no such {key}. There are: {', '.join(known)}")
         nodes: list[Any] = [schema()]

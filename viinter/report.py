@@ -155,10 +155,11 @@ def equal_radius(of: list[Run], paper: dict[str, Any]) -> list[Table | Picture |
         for p, runs in grouped(of, "codes.p", comparisons.P_ORDER).items() if runs
     }  # fmt: skip
     label = "mean Euclidean length of the codes, measured at the end"
-    length: Callable[[Run], float | None] = lambda run: run.metrics["code_length"]  # noqa: E731
     rows = {f"p = {p}, {at}": runs for p, by in grouped(of, "codes.p", comparisons.P_ORDER).items()
             for at, runs in grouped(by, "codes.length").items()}  # fmt: skip
 
+    def length(run: Run) -> float:
+        return run.metrics["code_length"]
 
     def plot(kind: str) -> Picture:
         draw = functools.partial(plots.psnr_against, lines, length, label, kind)

@@ -195,7 +195,7 @@ def circumstances(cfg: TrainConfig) -> str:
 
 def map_section(cfg: TrainConfig, found: dict[str, Any]) -> Section:
     runs, known = found["runs"], {axis.name: axis for axis in axes(cfg)}
-    flat = -10 * math.log10(found["flat_mse"])
+    flat = metrics.psnr(found["flat_mse"])
 
     def at(*chosen: tuple[Axis, str]) -> dict[str, Any]:
         return runs[key({axis.name: value for axis, value in chosen if value != axis.default})]
@@ -235,7 +235,8 @@ def map_section(cfg: TrainConfig, found: dict[str, Any]) -> Section:
 
 
 def decibel(mse: float) -> str:
-    return f"{-10 * math.log10(mse):.1f}" if mse > 0 else "exact"
+    psnr = metrics.psnr(mse)
+    return "exact" if psnr is None else f"{psnr:.1f}"
 
 
 def map_figure(cfg: TrainConfig, found: dict[str, Any]) -> Figure:
@@ -243,8 +244,8 @@ def map_figure(cfg: TrainConfig, found: dict[str, Any]) -> Figure:
     known = {axis.name: axis for axis in axes(cfg)}
     nothing = Axis("", "", [""], lambda _: {})
     panels = [(axis, nothing) for axis in known.values()] + [(known[a], known[b]) for a, b in pairs(cfg)]
-    best = max(-10 * math.log10(r["mse"]) for r in found["runs"].values() if r.get("mse"))
-    flat = -10 * math.log10(found["flat_mse"])
+    best = max(metrics.psnr(r["mse"]) for r in found["runs"].values() if r.get("mse"))
+    flat = metrics.psnr(found["flat_mse"])
     heights = [1] * len(known) + [len(known[b].values) for _, b in pairs(cfg)]
     figure, frames = plt.subplots(
         len(panels), 1, figsize=(7, 0.45 * sum(heights) + 0.75 * len(heights)), layout="constrained",
@@ -253,7 +254,7 @@ def map_figure(cfg: TrainConfig, found: dict[str, Any]) -> Figure:
     for frame, (a, b) in zip(frames, panels, strict=True):
         for (x, u), (y, v) in itertools.product(enumerate(a.values), enumerate(b.values)):
             run = found["runs"][key({i.name: w for i, w in ((a, u), (b, v)) if w != i.default})]
-            shown = -10 * math.log10(run["mse"]) if run.get("mse") else None
+            shown = metrics.psnr(run["mse"]) if run.get("mse") else None
             share = 0.0 if shown is None else min(max((shown - flat) / (best - flat), 0.0), 1.0)
             fails = run["verdict"] in ("fails", "refused")
             frame.add_patch(plt.Rectangle((x - 0.5, y - 0.5), 1, 1, color="0.75" if fails else plt.cm.viridis(share)))

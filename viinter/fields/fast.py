@@ -105,7 +105,7 @@ class FastField(Field):
 
     def textures(self) -> tuple[Tensor, Tensor]:
         """Colours [L, 3, h, w] and weights [L, 1, h', w'] at the level in training."""
-        return pyramid(self.colours[: self.level + 1]), pyramid(self.weights[: self.level + 1])
+        return tuple(pyramid(list(levels)[: self.level + 1]) for levels in (self.colours, self.weights))
 
     def place(self, z: Tensor) -> Tensor:
         """The motion's coefficients [V, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
@@ -193,7 +193,7 @@ class FastField(Field):
         return total
 
 
-def pyramid(levels: nn.ParameterList) -> Tensor:
+def pyramid(levels: list[Tensor]) -> Tensor:
     """The sum of the maps [N, C, h, w], at the size of the last, which alone is trained."""
     *before, last = levels
     if not before:
