@@ -126,7 +126,7 @@ def test_a_perfect_reconstruction_has_no_psnr(run, tmp_path):
 @both
 def test_a_checkerboard_of_single_pixels(run, model):
     board = ((torch.arange(32)[:, None] + torch.arange(32)) % 2).float()[..., None].expand(32, 32, 3)
-    found, _ = run([board] * 2, **model)
+    found, _ = run([board] * 2, **{**model, "optim.steps": 100})
     assert finite(found)
     flat_grey = metrics.psnr(0.25)
     assert found["known"]["psnr"] > (flat_grey - 0.1 if model is PAPER else 35)
@@ -172,8 +172,8 @@ def peak(work):
 @pytest.mark.parametrize("name", ["paper", "fast"])
 def test_a_frame_of_4096_x_4096_is_drawn_in_little_more_than_its_own_memory(name):
     field = PaperField(4, width=8, depth=2) if name == "paper" else FastField(
-        4, views=2, height=64, width=64, layers=1, motion=1, margin=1.1, sharpness=5.0, entropy=0.0,
-        remainder=False)  # fmt: skip
+        4, views=2, height=64, width=64, layers=1, sets=2, motion=1, margin=1.1, sharpness=5.0, entropy=0.0,
+        smooth=0.0, remainder=False)  # fmt: skip
     own = 4096 * 4096 * 3 * 4 / 2**20
     assert peak(lambda: draw(field.eval(), torch.ones(4), 4096, 4096)) < 3.5 * own
 

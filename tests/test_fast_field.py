@@ -14,7 +14,7 @@ M = 8
 
 def make(height: int = 64, width: int = 64, views: int = 2, **changes) -> FastField:
     torch.manual_seed(0)
-    settings = {"layers": 3, "motion": 6, "margin": 1.1, "sharpness": 5.0, "entropy": 1e-3,
+    settings = {"layers": 3, "sets": 2, "motion": 6, "margin": 1.1, "sharpness": 5.0, "entropy": 1e-3, "smooth": 0.0,
                 "remainder": True} | changes  # fmt: skip
     return FastField(M, views, height, width, **settings)
 
@@ -93,9 +93,22 @@ def test_the_penalty_is_greatest_undecided_and_nothing_once_each_pixel_has_one_l
     field(xy, z)
     assert field.penalty().item() == pytest.approx(1 - 1 / 4, abs=1e-6)
     with torch.no_grad():
-        field.weights[-1][2] = 10.0
+        field.weights[-1][2:4] = 10.0  # one of each set
     field(xy, z)
     assert field.penalty().item() == pytest.approx(0, abs=1e-6)
+
+
+def test_error_and_penalty_together_are_the_mean_error_of_the_sets():
+    field, xy, z = scramble(make(entropy=0.0)), torch.rand(1, 50, 2) * 2 - 1, torch.randn(1, M)
+    target = torch.rand(1, 50, 3)
+    loss = (field(xy, z) - target).square().mean() + field.penalty()
+    alone = []
+    for k in range(2):
+        one = make(sets=1)
+        one.load_state_dict({key: value[k::2] if len(value.shape) and len(value) == 6 else value
+                             for key, value in field.state_dict().items()})  # fmt: skip
+        alone.append((one(xy, z) - target).square().mean())
+    assert loss.item() == pytest.approx(torch.stack(alone).mean().item(), rel=1e-5)
 
 
 def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump():
@@ -128,13 +141,13 @@ def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross
     """Five views of a texture that moves 4 pixels from each to the next; the views half way between were never seen."""
     size, codes = 64, torch.randn(5, M, generator=torch.Generator().manual_seed(1))
     codes = torch.nn.Parameter(codes / codes.abs().sum(-1, keepdim=True))
-    x, y = pixel_grid(size, size).unbind(-1)
+    blobs = torch.rand(1, 3, 9, 12, generator=torch.Generator().manual_seed(0))
+    wide = torch.nn.functional.interpolate(blobs, (144, 192), mode="bicubic")[0].clamp(0, 1)
 
     def view(t: float) -> torch.Tensor:
-        moved = x - 4 * t * 2 / size
-        waves = [torch.sin(f * math.pi * moved + k) * torch.cos(g * math.pi * y) for k, (f, g) in
-                 enumerate([(2, 3), (3, 2), (5, 4)])]  # fmt: skip
-        return (0.5 + 0.4 * torch.stack(waves, -1)).view(size, size, 3)
+        moved = round(8 * t)
+        wider = wide[:, 8:136, 40 - moved : 168 - moved]
+        return torch.nn.functional.avg_pool2d(wider, 2).permute(1, 2, 0)
 
     views = torch.stack([view(k) for k in range(5)])
     field = make(size, size, views=5, layers=2)

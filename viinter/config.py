@@ -144,11 +144,13 @@ class PaperModel(ModelConfig):
 class FastModel(ModelConfig):
     """Layers of texture carried by a learned motion (`fields/fast.py`)."""
 
-    layers: int = setting(8, "surfaces that the scene is made of")
+    layers: int = setting(4, "surfaces that the scene is made of, in each set")
+    sets: int = setting(2, "sets of layers that see the scene each for itself; their mean is drawn")
     motion: int = setting(6, "motion polynomials: 1 shifts, 3 adds turns and zooms, 6 adds perspective")
     margin: float = setting(1.1, "size of a texture in views, for what moves in from outside")
     sharpness: float = setting(5.0, "scale of the layers' weights in their softmax")
     entropy: float = setting(1e-3, "weight of the penalty on pixels that mix layers")
+    smooth: float = setting(2e-3, "weight of the penalty on disparities that differ between pixels of one colour")
     remainder: bool = setting(True, "keep what the layers leave over of each known view, and share it out")
 
 
@@ -238,8 +240,8 @@ class EvaluateConfig:
     """`python -m viinter.evaluate`."""
 
     run: str = setting(MISSING, "run folder")
-    finetune_steps: int = setting(100, "steps of each probe's code against its target; 0 leaves finetuned codes out")
-    finetune_lr: float = setting(0.05, "step size of Adam at the start, as a share of the code book's rms entry")
+    finetune_steps: int = setting(300, "steps of each probe's code against its target; 0 leaves finetuned codes out")
+    finetune_lr: float = setting(0.15, "step size of Adam at the start, as a share of the code book's rms entry")
     finetune_pixels: int = setting(2048, "random pixels of a probe in a step")
     data: str | None = setting(None, "folder of the scenes, if they have moved since training (paths.data)")
     accelerator: str = setting("auto", "auto, cpu, cuda, mps")
@@ -330,14 +332,15 @@ def check(cfg: TrainConfig) -> None:
         "evaluation.chunk_pixels": cfg.evaluation.chunk_pixels, "logging.every_seconds": cfg.logging.every_seconds,
         "checkpoint.every_seconds": cfg.checkpoint.every_seconds,
     }  # fmt: skip
-    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "margin", "sharpness"):
+    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "sets", "margin", "sharpness"):
         if hasattr(cfg.model, key):
             positive[f"model.{key}"] = getattr(cfg.model, key)
     for key, value in positive.items():
         want(value > 0 and math.isfinite(value), key, value, "a number above 0")
     if isinstance(cfg.model, FastModel):
         want(cfg.model.motion in (1, 3, 6), "model.motion", cfg.model.motion, "1, 3 or 6")
-        want(cfg.model.entropy >= 0, "model.entropy", cfg.model.entropy, "0 or more")
+        for key, value in (("entropy", cfg.model.entropy), ("smooth", cfg.model.smooth)):
+            want(value >= 0, f"model.{key}", value, "0 or more")
         want(cfg.trainer.precision not in ("16-true", "bf16-true"), "trainer.precision", cfg.trainer.precision,
              "32-true, 64-true or a mixed one with model=fast: its motions are finer than 16 bits")  # fmt: skip
     want(cfg.interpolation.alpha >= 0, "interpolation.alpha", cfg.interpolation.alpha, "0 or more")

@@ -84,7 +84,7 @@ def axes(cfg: TrainConfig) -> list[Axis]:
     else:
         found += [
             one("sharpness", "model.sharpness", cfg.model.sharpness, 0.5, 50.0, 500.0),
-            one("layers (width)", "model.layers", cfg.model.layers, 1, 2, 32),
+            one("layers (width)", "model.layers", cfg.model.layers, 1, 2, 16),
             one("motion (depth)", "model.motion", cfg.model.motion, 1, 3),
         ]
     return found
@@ -281,7 +281,7 @@ def corners(cfg: TrainConfig) -> dict[str, list[str]]:
         found["model.layer_norm=false"] = ["model.layer_norm=false"]
         found["frequency 300, radius 1000"] = [*found["sine frequency 300"], "codes.radius=1000"]
     else:
-        found |= {f"{k}={v}": [f"{k}={v}"] for k, v in (("model.sharpness", 500), ("model.layers", 32))}
+        found |= {f"{k}={v}": [f"{k}={v}"] for k, v in (("model.sharpness", 500), ("model.layers", 16))}
     return found
 
 

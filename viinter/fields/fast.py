@@ -1,23 +1,27 @@
 """The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
 
-Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `L` layers, `K` motion
-polynomials. A layer has colours [3, h, w] at about the resolution of a view, weights and disparities. Under the code z
-the pixel xy reads layer l at
+Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `K` motion polynomials,
+`S` sets of layers, `L` layers in all of them. A layer has colours [3, h, w] at about the resolution of a view, weights
+and disparities. Under the code z the pixel xy reads layer l at
 
     u_l = xy + a(xy, z) + d_l(u) b(xy, z),      a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
 
 phi = {1, x, y, x^2, xy, y^2}, and a_k, b_k linear in z. That is the image motion of a rigid scene under a small camera
 motion (Longuet-Higgins and Prazdny 1980): `a` the part that a rotation gives every depth alike, `b` the part that a
 translation gives in proportion to inverse depth. Nothing is told to it: a_k(z), b_k(z), the disparities and the
-textures are all learned from the pixels. Since the motion is linear in z, a mix of codes moves each surface half way
-where a cross-fade would show it twice.
+textures are all learned from the pixels. But b_0 is written as a_0 and a difference, so that parallax begins along the
+motion of the whole, as it is under a pure translation: left to itself it may come out too strong in one direction,
+where horizontal and vertical edges then choose different disparities. Since the motion is linear in z, a mix of codes
+moves each surface half way where a cross-fade would show it twice.
 
 The disparity d_l(u) = d_l + delta_l(u) has a smooth map delta_l. The weights are coarser than the colours too: where a
 surface ends is a line, and pixels that go over to another surface in each view would learn known views by heart.
 
-The colour is the mean of the layers' colours, weighted by a softmax of their weights: not an alpha compositing, which
-trained more slowly and worse. Layered textures read through a homography are the multi-plane images of Zhou et al.
-2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
+A set's colour is the mean of its layers' colours, weighted by a softmax of their weights: not an alpha compositing,
+which trained more slowly and worse. What is drawn is the mean of the sets, and each is trained to be right by itself:
+where views leave something open, sets settle it differently, and their mean is nearer to the truth than either (as in
+the ensembles of Hansen and Salamon 1990). They share codes and motion. Layered textures read through a homography are
+the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
 
 What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
 view's remainder, read where the motion takes it, and shared among the known views nearest in motion.
@@ -35,12 +39,13 @@ from torch import Tensor, nn
 from viinter.fields.field import Field
 
 COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
+EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 4  # known views that share in a remainder
 REACH = 0.7  # how far a known view's remainder reaches, in distances to the view nearest to it
 
 
 class FastField(Field):
-    """F(xy | z) -> rgb from `layers` textures for `views` known views of `height` x `width`.
+    """F(xy | z) -> rgb from `sets` of `layers` textures each, for `views` known views of `height` x `width`.
 
     Coarse to fine: colours and weights are sums of levels, each twice as fine as the one before. `at(progress)` chooses
     the level in training; those before it are kept as they are, those after it do not take part. A level's weights have
@@ -48,10 +53,13 @@ class FastField(Field):
     `config.FastModel` for the other arguments.
     """
 
-    def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, motion: int, margin: float,
-                 sharpness: float, entropy: float, remainder: bool) -> None:  # fmt: skip
+    def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
+                 margin: float, sharpness: float, entropy: float, smooth: float, remainder: bool) -> None:  # fmt: skip
         super().__init__()
-        self.margin, self.sharpness, self.entropy, self.motion = margin, sharpness, entropy, motion
+        self.margin, self.sharpness, self.motion = margin, sharpness, motion
+        self.entropy, self.smooth = entropy, smooth
+        self.pitch = 2 / width
+        self.sets, layers = sets, layers * sets  # layer l belongs to set l % sets
         count = max(0, math.ceil(math.log2(min(height, width) / COARSEST))) + 1
         sizes = [(round(height * margin / 2**k), round(width * margin / 2**k)) for k in reversed(range(count))]
         self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
@@ -69,7 +77,7 @@ class FastField(Field):
         self.register_buffer("reach", torch.zeros(shape[0]))
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.level, self.decision = count - 1, 1.0
-        self.chosen: Tensor | None = None
+        self.held: Tensor | None = None
 
     def calibrate(self, codes: Tensor) -> None:
         """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
@@ -93,8 +101,9 @@ class FastField(Field):
     def at(self, progress: float) -> None:
         """Chooses the level in training for the share of the budget that is used, in [0, 1].
 
-        The finest level has 70 % of the budget, the one before 18 %, the coarser ones share the rest. The penalty is
-        faded in over the finest level's first part: a decision made before the motion is known is often wrong.
+        The finest level has 70 % of the budget, the one before 18 %, the coarser ones share the rest. The penalty on
+        mixed weights is faded in over the finest level's first part: a decision made before the motion is known is
+        often wrong.
         """
         self.finished.fill_(False)
         count = len(self.colours)
@@ -109,7 +118,8 @@ class FastField(Field):
 
     def place(self, z: Tensor) -> Tensor:
         """The motion's coefficients [V, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
-        return F.linear(z * self.gain, torch.cat([self.shift, self.bend]))
+        whole, difference = self.shift.chunk(2)
+        return F.linear(z * self.gain, torch.cat([whole, whole + difference, self.bend]))
 
     def carry(self, xy: Tensor, place: Tensor) -> Tensor:
         """The motions a and b [V, P, 4], in units of a texture, of pixels `xy` [V, P, 2]."""
@@ -135,19 +145,37 @@ class FastField(Field):
             delta = sample(self.delta, u)[:, 0]
             u, disparity = u + delta[..., None] * b[None], disparity + delta
         colours, weights = self.textures()
-        read = sample(torch.cat([colours, stretch(weights, colours)], 1), u)
-        weight = torch.softmax(self.sharpness * read[:, 3], 0)
+        read = sample(torch.cat([colours, stretch(weights, colours)], 1), u).unflatten(0, (-1, self.sets))
+        weight = torch.softmax(self.sharpness * read[:, :, 3], 0)
+        each = (weight[:, :, None] * read[:, :, :3]).sum(0)  # [S, 3, V, P]
+        mean = each.mean(0)
+        seen = (weight * disparity.unflatten(0, (-1, self.sets))).sum(0)  # the sets' disparities [S, V, P]
         if self.training and torch.is_grad_enabled():
-            self.chosen = weight
-        rgb = (weight[:, None] * read[:, :3]).sum(0).movedim(0, -1) + 0.5
+            undecided = (1 - weight.square().sum(0)).mean()
+            self.held = (each - mean).square().mean() + self.decision * self.entropy * undecided
+            self.held = self.held + self.smooth * self.roughness(xy, seen, each)
+        rgb = mean.movedim(0, -1) + 0.5
         if not self.training and self.finished:  # asked only here: on a GPU the answer must be waited for
-            rgb = rgb + self.left_over(xy, place, a, b, (weight * disparity).sum(0))
+            rgb = rgb + self.left_over(xy, place, a, b, seen.mean(0))
         return rgb
 
+    def roughness(self, xy: Tensor, disparity: Tensor, colour: Tensor) -> Tensor:
+        """How much `disparity` [S, V, P] differs between pixels that lie side by side, less where `colour` [S, 3, V, P]
+        does too (as in Godard et al. 2017). Of pixels drawn at random, few lie so; of rows, nearly all."""
+        beside = xy.diff(dim=1).abs().sum(-1) < 1.5 * self.pitch
+        edge = torch.exp(-EDGE * colour.detach().diff(dim=-1).abs().mean(1))
+        return (disparity.diff(dim=-1).abs() * edge * beside).sum() / disparity.numel()
+
     def penalty(self) -> Tensor:
-        """How undecided the pixels of the last call were between layers: the mean of 1 - sum_l w_l^2, weighted."""
-        weight, self.chosen = self.chosen, None
-        return self.decision * self.entropy * (1 - weight.square().sum(0)).mean()
+        """Three terms on the pixels of the last call.
+
+        How far the sets lie apart, which added to the error of their mean is the mean of their own errors (Krogh and
+        Vedelsby 1995). How undecided pixels were between layers: the mean of 1 - sum_l w_l^2, weighted. And
+        `roughness`, weighted: where nothing is seen to move, any disparity would do for the known views, but not
+        between them.
+        """
+        held, self.held = self.held, None
+        return held
 
     @torch.no_grad()
     def finish(self, views: Tensor, codes: Tensor) -> None:
