@@ -12,7 +12,7 @@ FLOORS = [
     ["scenes"],
     ["data", "module", "views", "peers"],
     ["callbacks", "checkpoints", "guard", "pictures", "step_times", "page", "runs", "comparisons", "evidence", "plots",
-     "twin"],
+     "races", "twin"],
     ["command", "train", "evaluate", "render", "download", "bench", "report", "stability"],
 ]
 # the few steps within a floor, each from the plainer to the one that uses it
@@ -23,7 +23,7 @@ WITHIN = {
     ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),
     ("comparisons", "page"), ("evidence", "comparisons"), ("evidence", "page"), ("evidence", "runs"),
-    ("plots", "evidence"), ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
+    ("plots", "evidence"), ("races", "runs"), ("races", "evidence"), ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
     ("stability", "command"), ("stability", "train"),
 }  # fmt: skip
 FLOOR = {name: k for k, names in enumerate(FLOORS) for name in names}

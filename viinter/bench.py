@@ -1,5 +1,5 @@
-"""`python -m viinter.bench step | alpha`: what the framework costs over the same step in a bare PyTorch loop, and
-what the interpolation loss costs where a scene wants it.
+"""`python -m viinter.bench step | alpha | fast | scaling`: what the framework costs over the same step in a bare loop,
+what the interpolation loss costs where a scene wants it, and how `model=fast` stands against the published network.
 
 A step and its bare twin are timed in turns in one process: after every step of the real training, with all its
 callbacks, a twin of the model takes one step in plain PyTorch. Whatever the machine does meanwhile, it does to both.
@@ -19,14 +19,16 @@ from typing import Any
 
 import lightning as L
 import torch
+from hydra.core.hydra_config import HydraConfig
 from rich.console import Console
 from rich.table import Table
 
-from viinter import command, config
-from viinter.config import TrainConfig
+from viinter import command, config, peers, races, scenes
+from viinter.config import ConfigError, Layout, TrainConfig
 from viinter.data import PixelStore
+from viinter.evidence import TARGETS, seconds_to
 from viinter.module import ViewInterpolator
-from viinter.train import train
+from viinter.train import train, write_json
 
 ABOUT = """
 Times a training step through viinter.train against the same step in a bare PyTorch loop, in turns in one process, and
@@ -35,6 +37,10 @@ says where the time goes. Settings are those of viinter.train.
   python -m viinter.bench step                                       width 128, depth 5, the shipped scene, 200 steps
   python -m viinter.bench step model.width=512 model.depth=8 threads=2
   python -m viinter.bench alpha model=fast                           the same run with and without L_inter and its tower
+  python -m viinter.bench fast scene=stanford/knights threads=2      the published network as it is and tuned, half an
+                                                                     hour each, and model=fast in parts of that
+  python -m viinter.bench scaling scene=stanford/knights threads=2   model=fast over numbers and sizes of views
+  python -m viinter.bench fast ... hydra.run.dir=DIR                 goes on with one that was interrupted
 """
 
 WARM_UP = 10
@@ -199,11 +205,105 @@ def random_tower(model: str, folder: Path) -> Path:
     return file
 
 
-BENCHES = {"step": step, "alpha": alpha}
+def typed() -> list[str]:
+    """The command line's settings, without those that a race sets itself."""
+    own = ("model=", "optim.training_seconds=", "hydra.", "scene.root=", "scene.downsample=")
+    return [o for o in HydraConfig.get().overrides.task if not o.startswith(own)]
+
+
+def shown(title: str, columns: list[str], rows: list[list[str]]) -> None:
+    """Prints a table; its first column is text, the others numbers."""
+    table = Table(title=title, title_justify="left")
+    for k, column in enumerate(columns):
+        table.add_column(column, justify="right" if k else "left")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def either(value: float | None, digits: int = 1) -> str:
+    return "not reached" if value is None else f"{value:.{digits}f}"
+
+
+def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
+    """`races.methods` on one scene and seed, one after another, beside what needs no training; printed as tables, and
+    kept in `bench.json`. `optim.training_seconds` is the time of the published network."""
+    scene = scenes.load(cfg.scene)
+    where = [f"scene.root={cfg.scene.root}", f"scene.downsample={cfg.scene.downsample}"]
+    asked = [*typed(), *where, "evaluation.first_seconds=1"]
+    found = {}
+    for name, own in races.methods(cfg.optim.training_seconds).items():
+        Console().rule(name)
+        found[name] = races.train(folder / name.replace(" ", "_").replace("/", "_"), own, asked)
+    rows = [
+        [name, f"{r.metrics['steps']}", f"{r.metrics['training_seconds']:.1f}", f"{r.value('known', 'psnr'):.2f}",
+         f"{r.value('novel', 'psnr'):.2f}", *(either(seconds_to(r, target)) for target in TARGETS)]
+        for name, r in found.items()
+    ]  # fmt: skip
+    untrained = {k: f["psnr"] for k, f in peers.measure(scene).items() if not isinstance(f, str)}
+    rows += [[f"{name}, no training", "", "", "", f"{psnr:.2f}", *("" for _ in TARGETS)]
+             for name, psnr in untrained.items()]  # fmt: skip
+    columns = ["", "steps", "training s", "known", "novel", *(f"s to {target} dB" for target in TARGETS)]
+    threads = cfg.threads or torch.get_num_threads()
+    shown(f"{scene.name}, {scene.width} x {scene.height}, {threads} threads", columns, rows)
+    for name, r in found.items():
+        keys = ("training_seconds", "known_psnr", "novel_psnr")
+        shown(f"{name}: PSNR along the way", list(keys), [[either(row[k]) for k in keys] for row in r.rows])
+    ends = {name: r.value("novel", "psnr") for name, r in found.items()}
+    published, tuned, *parts = ends
+    for slow, part in ((published, parts[0]), (tuned, parts[1])):
+        verb = "reaches" if ends[part] >= ends[slow] else "does not reach"
+        Console().print(f"{part}: {ends[part]:.2f} dB, {verb} {slow}: {ends[slow]:.2f} dB", highlight=False)
+    Console().print(f"curves and pictures: python -m viinter.report {folder}", highlight=False, soft_wrap=True)
+    result = {"novel": ends, "peers": untrained}
+    write_json(folder / "bench.json", result)
+    return result
+
+
+def scaling(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
+    """What `model=fast` costs over the number of known views and over their size, three of each, on a planar scene:
+    training seconds to 28 dB at the probes, a step's milliseconds, peak megabytes, and the exponents; and what a step's
+    operations and bytes predict for a GPU. Printed as tables, and kept in `bench.json`."""
+    if cfg.scene.layout is not Layout.planar:
+        raise ConfigError(f"scene.layout={cfg.scene.layout.name}: expected a planar scene, whose grid can be cut down")
+    asked = [*typed(), "model=fast", f"optim.training_seconds={cfg.optim.training_seconds:g}",
+             "evaluation.first_seconds=0.5", "evaluation.factor=1.15", "evaluation.max_share=2"]  # fmt: skip
+    result = {}
+    whole, factor = scenes.load(cfg.scene), cfg.scene.downsample
+    sizes = {"number of views": {side * side: ([f"scene.downsample={factor}"], side) for side in (3, 4, 5)},
+             "pixels of a view": {whole.height * whole.width // by**2: ([f"scene.downsample={factor * by}"], 5)
+                                  for by in (4, 2, 1)}}  # fmt: skip
+    for what, each in sizes.items():
+        measured = {}
+        for size, (own, side) in each.items():
+            Console().rule(f"{what}: {size}")
+            root = races.block(Path(cfg.scene.root), side, folder / f"grid_{side}")
+            run = races.train(folder / f"{what.replace(' ', '_')}_{size}", [*own, f"scene.root={root}"], asked)
+            measured[size] = races.costs(run, SCALING_TARGET)
+        keys = ("seconds", "ms", "MB")
+        powers = {key: races.exponent(list(measured), [m[key] for m in measured.values()]) for key in keys}
+        rows = [[str(size), *(either(m[key]) for key in keys)] for size, m in measured.items()]
+        rows.append(["exponent", *("" if powers[key] is None else f"{powers[key]:.2f}" for key in keys)])
+        shown(f"by {what}", [what, f"s to {SCALING_TARGET} dB", "ms a step", "peak MB"], rows)
+        result[what] = {"measured": measured, "exponents": powers}
+    result["a step"] = races.step_work(whole.height, whole.width, 8, 65_536)
+    shown("One step, 8 layers, 65,536 pixels", ["", *result["a step"]],
+          [["model=fast", *(f"{value:.3g}" for value in result["a step"].values())]])  # fmt: skip
+    write_json(folder / "bench.json", result)
+    return result
+
+
+SCALING_TARGET = 28  # dB
+BENCHES = {"step": step, "alpha": alpha, "fast": fast, "scaling": scaling}
+RACES = {"fast": 1800, "scaling": 60}  # training seconds
 
 
 def presets(what: str, arguments: list[str]) -> list[str]:
-    """Settings for a bench of a minute; sizes of the published network's where it is the one that is timed."""
+    """Settings for a bench of a minute, sizes of the published network's where it is the one that is timed; for a race
+    its time and its folder."""
+    if what in RACES:
+        return [f"optim.training_seconds={RACES[what]}", "hydra.output_subdir=null",
+                f"hydra.run.dir=outputs/bench_{what}/${{now:%Y-%m-%d_%H-%M-%S}}"]  # fmt: skip
     found = ["logging.pictures=false", "evaluation.max_share=0", "optim.training_seconds=null", "hydra.run.dir=.",
              "hydra.output_subdir=null", f"optim.steps={210 if what == 'step' else 50}"]  # fmt: skip
     if not any(a.startswith("model=") and a != "model=paper" for a in arguments):

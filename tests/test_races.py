@@ -1,0 +1,104 @@
+"""Trainings side by side: what they are, what they cost, and the benches that print them."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from viinter import bench, image, races, runs
+from viinter.config import ConfigError, UserError
+from viinter.train import train
+
+
+def test_an_exponent_is_the_slope_of_the_logarithms():
+    assert races.exponent([1, 4, 16], [3.0, 24.0, 192.0]) == pytest.approx(1.5)
+    assert races.exponent([9, 16, 25], [1.0, None, 3.0]) is None
+    assert races.exponent([9, 9], [1.0, 2.0]) is None
+
+
+def test_the_fast_runs_have_parts_of_the_published_time_each_with_a_schedule_of_its_own():
+    budgets = {name: own[-1] for name, own in races.methods(1800).items()}
+    assert list(budgets.values()) == [f"optim.training_seconds={s}" for s in ("1800", "1800", "1.8", "30", "600")]
+
+
+def grid(root: Path, side: int) -> Path:
+    for y in range(0, 4 * side - 3, 2):
+        for x in range(0, 4 * side - 3, 2):
+            ramp = torch.linspace(0, 1, 48)[None, :, None].expand(40, 48, 3)
+            image.write(root / f"view_{y:02}_{x:02}.png", torch.roll(ramp, (x + y) // 2, 1))
+    return root
+
+
+def test_a_block_of_a_grid_has_the_files_among_its_first_known_views(tmp_path):
+    found = races.block(grid(tmp_path / "grid", 3), 2, tmp_path / "block")
+    assert sorted(f.name for f in found.iterdir()) == [f"view_{y:02}_{x:02}.png" for y in (0, 2, 4) for x in (0, 2, 4)]
+    assert len(list(races.block(tmp_path / "grid", 3, tmp_path / "block").iterdir())) == 25  # made anew
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "a.png").touch()
+    with pytest.raises(UserError, match=r"named \.\.\._RR_CC"):
+        races.block(tmp_path / "other", 3, tmp_path / "nothing")
+
+
+def test_a_training_is_a_command_that_is_not_repeated_and_whose_failure_is_told(tmp_path, capfd):
+    common = ["scale=smoke", "scene=folder", f"scene.root={grid(tmp_path / 'views', 2)}", "logging.pictures=false"]
+    found = races.train(tmp_path / "run", ["model=fast", "optim.steps=3"], common)
+    assert found.metrics["steps"] == 3
+    before = (tmp_path / "run" / "metrics.json").stat().st_mtime_ns
+    races.train(tmp_path / "run", ["model=fast", "optim.steps=3"], common)
+    assert (tmp_path / "run" / "metrics.json").stat().st_mtime_ns == before
+    (tmp_path / "run" / "metrics.json").unlink()  # as if it had been killed before its end
+    assert races.train(tmp_path / "run", ["model=fast", "optim.steps=3"], common).metrics["steps"] == 3
+    with pytest.raises(UserError, match=r"holds a run of .* model=fast optim\.steps=3, not of .* optim\.steps=4;"):
+        races.train(tmp_path / "run", ["model=fast", "optim.steps=4"], common)
+    with pytest.raises(UserError, match=r"viinter\.train .* optim\.steps=x .* failed"):
+        races.train(tmp_path / "other", ["model=fast", "optim.steps=x"], common)
+    assert "optim.steps" in capfd.readouterr().err
+
+
+@pytest.fixture
+def here(monkeypatch, make_config):
+    """Trainings of 8 steps in this process in place of commands; the list of what was asked of them."""
+    asked = []
+
+    def trained(folder, own, common):
+        asked.append(settings := dict(o.split("=", 1) for o in [*common, *own]))
+        values = {"model": settings["model"], "optim.steps": 8, "logging.pictures": False,
+                  "scene.downsample": int(settings["scene.downsample"])}  # fmt: skip
+        train(make_config("planar", settings["scene.root"], **values), folder)
+        return runs.read([folder])[0]
+
+    monkeypatch.setattr(races, "train", trained)
+    monkeypatch.setattr(bench, "typed", lambda: [])
+    return asked
+
+
+def test_bench_fast_tells_what_each_reached_and_what_needs_no_training(make_config, tmp_path, here, capsys):
+    cfg = make_config("planar", grid(tmp_path / "grid", 2), **{"optim.training_seconds": 1800.0})
+    found = bench.fast(cfg, tmp_path / "bench")
+    assert [a["optim.training_seconds"] for a in here] == ["1800", "1800", "1.8", "30", "600"]
+    assert list(found["novel"]) == list(races.methods(1800))
+    assert all(psnr > 0 for psnr in found["novel"].values())
+    assert "blend" in found["peers"]
+    assert json.loads((tmp_path / "bench" / "bench.json").read_text()) == found
+    out = capsys.readouterr().out
+    assert "along the way" in out
+    assert "1/1000" in out
+
+
+def test_bench_scaling_measures_three_numbers_and_three_sizes(make_config, tmp_path, here, capsys):
+    cfg = make_config("planar", grid(tmp_path / "grid", 5), **{"optim.training_seconds": 5.0})
+    found = bench.scaling(cfg, tmp_path / "bench")
+    assert list(found["number of views"]["measured"]) == [9, 16, 25]
+    assert list(found["pixels of a view"]["measured"]) == [120, 480, 1920]
+    assert all(m["ms"] > 0 and m["MB"] > 0 for m in found["number of views"]["measured"].values())
+    assert found["a step"]["MB"] > 0
+    assert "exponent" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match="expected a planar scene"):
+        bench.scaling(make_config("folder", tmp_path / "grid"), tmp_path / "bench")
+
+
+def test_a_race_has_its_own_time_and_folder():
+    assert "optim.training_seconds=1800" in bench.presets("fast", [])
+    assert "optim.training_seconds=60" in bench.presets("scaling", [])
+    assert not [p for p in bench.presets("fast", []) if p.startswith("model.")]
