@@ -29,9 +29,9 @@ def scramble(field: FastField) -> FastField:
 def test_motion_is_linear_in_the_code_so_that_a_mix_moves_half_way():
     field = scramble(make())
     z = torch.randn(2, M)
-    xy = pixel_grid(8, 8)[None]
-    ends = field.carry(xy.expand(2, -1, -1), field.place(z))
-    middle = field.carry(xy, field.place(z.mean(0, keepdim=True)))
+    phi = field.basis(pixel_grid(8, 8).T[None])
+    ends = field.carry(phi.expand(2, -1, -1), field.place(z))
+    middle = field.carry(phi, field.place(z.mean(0, keepdim=True)))
     assert torch.allclose(middle[0], ends.mean(0), atol=1e-6)
 
 
@@ -124,6 +124,33 @@ def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump
     frames = [draw(field, lerp(codes[0], codes[1], t / 200), 40, 48) for t in range(201)]
     steps = torch.tensor([(b - a).abs().mean() for a, b in zip(frames, frames[1:], strict=False)])  # noqa: RUF007
     assert steps.max() < 10 * steps.mean()
+
+
+def test_what_is_kept_between_calls_follows_every_change_of_the_weights():
+    """Optimiser steps at each level, a restored state and another precision: drawing shows the weights as they are."""
+    field, z = make(128, 128, remainder=False), torch.randn(2, M)
+    xy, target = torch.rand(2, 50, 2) * 2 - 1, torch.rand(2, 50, 3)
+    optimizer = torch.optim.Adam(field.parameters(), lr=0.05, fused=True)
+
+    def fresh() -> torch.Tensor:
+        other = make(128, 128, remainder=False)
+        other.load_state_dict(field.state_dict())
+        other.level = field.level
+        return other.eval()(xy, z).detach()
+
+    for progress in (0.0, 0.2, 0.5, 1.0):
+        field.at(progress)
+        for _ in range(2):
+            optimizer.zero_grad()
+            field.train()
+            ((field(xy, z) - target).square().mean() + field.penalty()).backward()
+            optimizer.step()
+            with torch.no_grad():
+                assert torch.allclose(field.eval()(xy, z), fresh(), atol=1e-6)
+    field.load_state_dict({k: v + 0.1 if v.is_floating_point() else v for k, v in field.state_dict().items()})
+    with torch.no_grad():
+        assert torch.allclose(field(xy, z), fresh(), atol=1e-6)
+        assert field.double()(xy.double(), z.double()).dtype == torch.float64
 
 
 def test_training_again_leaves_the_remainder_out():

@@ -23,7 +23,8 @@ WITHIN = {
     ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),
     ("comparisons", "page"), ("evidence", "comparisons"), ("evidence", "page"), ("evidence", "runs"),
-    ("plots", "evidence"), ("races", "runs"), ("races", "evidence"), ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
+    ("plots", "evidence"), ("races", "runs"), ("races", "evidence"),
+    ("comparisons", "runs"), ("plots", "pictures"), ("plots", "runs"), ("report", "command"),
     ("stability", "command"), ("stability", "train"),
 }  # fmt: skip
 FLOOR = {name: k for k, names in enumerate(FLOORS) for name in names}

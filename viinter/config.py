@@ -240,8 +240,8 @@ class EvaluateConfig:
     """`python -m viinter.evaluate`."""
 
     run: str = setting(MISSING, "run folder")
-    finetune_steps: int = setting(300, "steps of each probe's code against its target; 0 leaves finetuned codes out")
-    finetune_lr: float = setting(0.15, "step size of Adam at the start, as a share of the code book's rms entry")
+    finetune_steps: int = setting(400, "steps of each probe's code against its target; 0 leaves finetuned codes out")
+    finetune_lr: float = setting(0.05, "step size of Adam at the start, as a share of the code book's rms entry")
     finetune_pixels: int = setting(2048, "random pixels of a probe in a step")
     data: str | None = setting(None, "folder of the scenes, if they have moved since training (paths.data)")
     accelerator: str = setting("auto", "auto, cpu, cuda, mps")

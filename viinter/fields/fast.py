@@ -30,6 +30,7 @@ view's remainder, read where the motion takes it, and shared among the known vie
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -56,6 +57,8 @@ class FastField(Field):
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
                  margin: float, sharpness: float, entropy: float, smooth: float, remainder: bool) -> None:  # fmt: skip
         super().__init__()
+        self.held: Tensor | None = None  # the penalty of the last call
+        self.kept: dict[str, tuple[list, Tensor]] = {}
         self.margin, self.sharpness, self.motion = margin, sharpness, motion
         self.entropy, self.smooth = entropy, smooth
         self.pitch = 2 / width
@@ -77,7 +80,6 @@ class FastField(Field):
         self.register_buffer("reach", torch.zeros(shape[0]))
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.level, self.decision = count - 1, 1.0
-        self.held: Tensor | None = None
 
     def calibrate(self, codes: Tensor) -> None:
         """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
@@ -109,23 +111,61 @@ class FastField(Field):
         count = len(self.colours)
         coarse = count - 2
         ends = [0.12 * (k + 1) / coarse for k in range(coarse)] + [0.30, 1.0]
-        self.level = next((k for k, end in enumerate(ends[-count:]) if progress < end), count - 1)
+        level = next((k for k, end in enumerate(ends[-count:]) if progress < end), count - 1)
+        if level != self.level:
+            self.kept.clear()
+        self.level = level
         self.decision = min(max((progress - 0.3) / 0.3, 0.0), 1.0)
 
-    def textures(self) -> tuple[Tensor, Tensor]:
-        """Colours [L, 3, h, w] and weights [L, 1, h', w'] at the level in training."""
-        return tuple(pyramid(list(levels)[: self.level + 1]) for levels in (self.colours, self.weights))
+    def textures(self) -> Tensor:
+        """Colours and weights [L, 4, h, w] at the level in training.
+
+        What stays the same from call to call is kept: while one level is trained the sum of those before it, and in
+        evaluation, where no gradient is asked for, all of it.
+        """
+        colours, weights = (list(group)[: self.level + 1] for group in (self.colours, self.weights))
+        if not self.training and not torch.is_grad_enabled():
+            return self._kept("drawn", [*colours, *weights], lambda: self._together(pyramid(colours), pyramid(weights)))
+        return self._together(self._trained("colours", colours), self._trained("weights", weights))
+
+    @staticmethod
+    def _together(colours: Tensor, weights: Tensor) -> Tensor:
+        return torch.cat([colours, stretch(weights, colours)], 1)
+
+    def _trained(self, name: str, levels: list[Tensor]) -> Tensor:
+        *before, last = levels
+        return self._kept(name, before, lambda: stretch(pyramid(before), last).detach()) + last if before else last
+
+    def _kept(self, name: str, of: list[Tensor], make: Callable[[], Tensor]) -> Tensor:
+        """What `make()` gave the last time, if the tensors `of` that it is made of are the same since.
+
+        A fused optimiser changes weights without counting it in their `_version`: see `at` and `train`.
+        """
+        now = [(t.data_ptr(), t._version, t.dtype) for t in of]
+        was, found = self.kept.get(name, (None, None))
+        if was != now:
+            found = make()
+            self.kept[name] = now, found
+        return found
+
+    def train(self, mode: bool = True) -> FastField:
+        self.kept.clear()
+        return super().train(mode)
 
     def place(self, z: Tensor) -> Tensor:
         """The motion's coefficients [V, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
         whole, difference = self.shift.chunk(2)
         return F.linear(z * self.gain, torch.cat([whole, whole + difference, self.bend]))
 
-    def carry(self, xy: Tensor, place: Tensor) -> Tensor:
-        """The motions a and b [V, P, 4], in units of a texture, of pixels `xy` [V, P, 2]."""
-        x, y = xy.unbind(-1)
-        phi = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y][: self.motion], -1)
-        return phi @ place.view(-1, self.motion, 4) / self.margin
+    def basis(self, xy: Tensor) -> Tensor:
+        """The polynomials phi [V, K, P] at the pixels `xy` [V, 2, P]: planes, with which products are ten times as
+        fast on a CPU as with pixels that hold their K or 2 numbers together."""
+        x, y = xy.unbind(1)
+        return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y][: self.motion], 1)
+
+    def carry(self, phi: Tensor, place: Tensor) -> Tensor:
+        """The motions a and b [V, 4, P], in units of a texture, from `basis` and `place`."""
+        return (place.view(-1, self.motion, 4) / self.margin).transpose(1, 2) @ phi
 
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
         """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped.
@@ -134,18 +174,19 @@ class FastField(Field):
         would be wrong by parts of a pixel, and there are no matrix products that would gain.
         """
         with torch.autocast(xy.device.type, enabled=False):
-            return self._colours(xy.to(self.shift.dtype), z.to(self.shift.dtype))
+            return self._colours(xy.to(self.shift.dtype).transpose(1, 2).contiguous(), z.to(self.shift.dtype))
 
     def _colours(self, xy: Tensor, z: Tensor) -> Tensor:
+        """As `forward`, from `xy` [V, 2, P]."""
         place = self.place(z)
-        a, b = self.carry(xy, place).split(2, -1)
+        phi = self.basis(xy)
+        a, b = self.carry(phi, place).split(2, 1)
         u = (xy / self.margin + a)[None] + self.disparity[:, None, None, None] * b[None]
         disparity = self.disparity[:, None, None]
         if self.level >= min(2, len(self.colours) - 1):
             delta = sample(self.delta, u)[:, 0]
-            u, disparity = u + delta[..., None] * b[None], disparity + delta
-        colours, weights = self.textures()
-        read = sample(torch.cat([colours, stretch(weights, colours)], 1), u).unflatten(0, (-1, self.sets))
+            u, disparity = u + delta[:, :, None] * b[None], disparity + delta
+        read = sample(self.textures(), u).unflatten(0, (-1, self.sets))
         weight = torch.softmax(self.sharpness * read[:, :, 3], 0)
         each = (weight[:, :, None] * read[:, :, :3]).sum(0)  # [S, 3, V, P]
         mean = each.mean(0)
@@ -156,13 +197,13 @@ class FastField(Field):
             self.held = self.held + self.smooth * self.roughness(xy, seen, each)
         rgb = mean.movedim(0, -1) + 0.5
         if not self.training and self.finished:  # asked only here: on a GPU the answer must be waited for
-            rgb = rgb + self.left_over(xy, place, a, b, seen.mean(0))
+            rgb = rgb + self.left_over(xy, phi, place, seen.mean(0))
         return rgb
 
     def roughness(self, xy: Tensor, disparity: Tensor, colour: Tensor) -> Tensor:
         """How much `disparity` [S, V, P] differs between pixels that lie side by side, less where `colour` [S, 3, V, P]
         does too (as in Godard et al. 2017). Of pixels drawn at random, few lie so; of rows, nearly all."""
-        beside = xy.diff(dim=1).abs().sum(-1) < 1.5 * self.pitch
+        beside = xy.diff(dim=-1).abs().sum(1) < 1.5 * self.pitch
         edge = torch.exp(-EDGE * colour.detach().diff(dim=-1).abs().mean(1))
         return (disparity.diff(dim=-1).abs() * edge * beside).sum() / disparity.numel()
 
@@ -186,11 +227,14 @@ class FastField(Field):
         x = -1 + 2 * torch.arange(width, device=views.device) / width
         y = -1 + 2 * torch.arange(height, device=views.device) / height
         self.finished.fill_(False)
+        was = self.training
+        self.eval()
         for k, view in enumerate(views):
             for rows in torch.arange(height, device=views.device).split(max(1, 65_536 // width)):
                 xy = torch.stack(torch.meshgrid(x, y[rows], indexing="xy"), -1).flatten(0, 1)
                 drawn = self(xy[None], codes[k : k + 1])[0].view(len(rows), width, 3)
                 self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).to(self.remainder.dtype)
+        self.train(was)
         self.places.copy_(self.place(codes))
         apart = torch.cdist(self.places, self.places).fill_diagonal_(math.inf).amin(1)
         # two views at one place would reach nowhere; all of them at one place still share their remainders there
@@ -198,8 +242,8 @@ class FastField(Field):
         self.reach.copy_(REACH * apart if len(views) > 1 else torch.ones(1))
         self.finished.fill_(True)
 
-    def left_over(self, xy: Tensor, place: Tensor, a: Tensor, b: Tensor, disparity: Tensor) -> Tensor:
-        """The known views' remainders [V, P, 3] at pixels that move by `a`, `b` and have the mean `disparity` [V, P].
+    def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, disparity: Tensor) -> Tensor:
+        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place` with mean `disparity` [V, P].
 
         A known view's share falls with the square of its distance in motion; what the first view that is left out
         would have had is taken from all, so that a view enters and leaves a path without a jump.
@@ -210,11 +254,12 @@ class FastField(Field):
             shares, views = (shares - shares[:, -1:])[:, :-1], views[:, :-1]
         shares = shares / shares.sum(-1, keepdim=True).clamp_min(1e-12)
         _, _, height, width = self.remainder.shape
-        scale = xy.new_tensor([width, height]) / (xy.new_tensor([width, height]) - 1).clamp_min(1)
+        size = xy.new_tensor([[width], [height]])
+        scale = size / (size - 1).clamp_min(1)
         total = 0
         for share, view in zip(shares.unbind(-1), views.unbind(-1), strict=True):
-            a_there, b_there = self.carry(xy, self.places[view]).split(2, -1)
-            there = xy + self.margin * ((a - a_there) + disparity[..., None] * (b - b_there))
+            a, b = (self.margin * self.carry(phi, place - self.places[view])).split(2, 1)  # from there to here
+            there = xy + a + disparity[:, None] * b
             there = (there + 1) * scale - 1  # pixel centres at both ends, as grid_sample counts
             read = sample(self.remainder[view].to(there.dtype), there[:, None])[:, :, 0]
             total = total + share[:, None, None] * read.movedim(1, -1)
@@ -222,14 +267,11 @@ class FastField(Field):
 
 
 def pyramid(levels: list[Tensor]) -> Tensor:
-    """The sum of the maps [N, C, h, w], at the size of the last, which alone is trained."""
-    *before, last = levels
-    if not before:
-        return last
-    total = before[0].detach()
-    for own in before[1:]:
-        total = stretch(total, own) + own.detach()
-    return stretch(total, last) + last
+    """The sum of the maps [N, C, h, w], at the size of the last."""
+    total = levels[0]
+    for own in levels[1:]:
+        total = stretch(total, own) + own
+    return total
 
 
 def stretch(maps: Tensor, like: Tensor) -> Tensor:
@@ -238,5 +280,5 @@ def stretch(maps: Tensor, like: Tensor) -> Tensor:
 
 
 def sample(maps: Tensor, u: Tensor) -> Tensor:
-    """Maps [N, C, h, w] read at `u` [N, V, P, 2] in [-1, 1] (corner pixels at the ends), [N, C, V, P]."""
-    return F.grid_sample(maps, u, mode="bilinear", padding_mode="border", align_corners=True)
+    """Maps [N, C, h, w] read at `u` [N, V, 2, P] in [-1, 1] (corner pixels at the ends), [N, C, V, P]."""
+    return F.grid_sample(maps, u.movedim(2, -1), mode="bilinear", padding_mode="border", align_corners=True)
