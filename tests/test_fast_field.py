@@ -65,6 +65,17 @@ def test_levels_go_from_coarse_to_fine_and_the_finest_has_seven_tenths_of_the_bu
     assert finest == pytest.approx(1.0 if size == 32 else 0.7, abs=0.01)
 
 
+def test_in_long_runs_coarse_levels_end_after_so_many_steps():
+    field = make(256, 256, views=0, layers=1)
+    first = {}
+    for step in range(20_000):
+        field.at(step / 20_000, step)
+        first.setdefault(field.level, step)
+    assert first == {0: 0, 1: 100, 2: 200, 3: 500}
+    field.at(0.31, 400)  # in a short one they end by their share of the budget
+    assert field.level == 3
+
+
 def test_only_the_level_in_training_gets_a_gradient_and_whatever_moves_slows_down():
     field = make(128, 128)
     xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)

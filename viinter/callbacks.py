@@ -116,7 +116,7 @@ class Budget(L.Callback):
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
         progress = agreed(trainer, self.progress(trainer))
-        module.field.at(progress)
+        module.field.at(progress, trainer.global_step)
         factor = self.factor(progress)
         for group, rate in zip(trainer.optimizers[0].param_groups, module.field.rates(), strict=True):
             group["lr"] = group["initial_lr"] * factor * rate

@@ -40,6 +40,7 @@ from torch import Tensor, nn
 from viinter.fields.field import Field
 
 COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
+MOST = 100, 300  # steps at each of the coarse levels, and at half size
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 4  # known views that share in a remainder
 REACH = 0.7  # how far a known view's remainder reaches, in distances to the view nearest to it
@@ -100,18 +101,20 @@ class FastField(Field):
         moves = 0.5**self.level
         return [1.0, 1.0, moves, moves, moves]
 
-    def at(self, progress: float) -> None:
-        """Chooses the level in training for the share of the budget that is used, in [0, 1].
+    def at(self, progress: float, step: int = 0) -> None:
+        """Chooses the level in training for the share of the budget that is used, in [0, 1], and the step.
 
-        The finest level has 70 % of the budget, the one before 18 %, the coarser ones share the rest. The penalty on
-        mixed weights is faded in over the finest level's first part: a decision made before the motion is known is
-        often wrong.
+        The finest level has 70 % of the budget, the one before 18 %, the coarser ones share the rest, but none of them
+        more steps than `MOST`: textures that are finished before the motion is known hold it where it is. The penalty
+        on mixed weights is faded in over the finest level's first part: a decision made then is often wrong too.
         """
         self.finished.fill_(False)
         count = len(self.colours)
         coarse = count - 2
         ends = [0.12 * (k + 1) / coarse for k in range(coarse)] + [0.30, 1.0]
-        level = next((k for k, end in enumerate(ends[-count:]) if progress < end), count - 1)
+        most = [MOST[0] * (k + 1) for k in range(coarse)] + [MOST[0] * max(0, coarse) + MOST[1], math.inf]
+        stages = zip(ends[-count:], most[-count:], strict=True)
+        level = next((k for k, (end, last) in enumerate(stages) if progress < end and step < last), count - 1)
         if level != self.level:
             self.kept.clear()
         self.level = level

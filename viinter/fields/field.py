@@ -23,8 +23,8 @@ class Field(nn.Module):
         """The optimiser's groups: `params`, and `share`, their learning rate as a share of `optim.lr`."""
         return [{"params": [*self.parameters(), codes], "share": 1.0}]
 
-    def at(self, progress: float) -> None:
-        """Called before each step with the share of the budget that is used, in [0, 1]."""
+    def at(self, progress: float, step: int = 0) -> None:
+        """Called before each step with the share of the budget that is used, in [0, 1], and the steps taken."""
 
     def rates(self) -> list[float]:
         """A factor on the learning rate of each of `parameter_groups`, after `at`."""
