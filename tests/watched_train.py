@@ -68,3 +68,5 @@ for owner, name in ((callbacks.Budget, "on_train_end"), (train, "write_json")):
 
 if __name__ == "__main__":
     train.main()
+    if wanted != "none" and come >= int(count):
+        time.sleep(10)  # what was left to do took less than the plan's delay: the kill is on its way
