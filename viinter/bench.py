@@ -221,7 +221,7 @@ def shown(title: str, columns: list[str], rows: list[list[str]]) -> None:
     Console().print(table)
 
 
-def either(value: float | None, digits: int = 1) -> str:
+def reached(value: float | None, digits: int = 1) -> str:
     return "not reached" if value is None else f"{value:.{digits}f}"
 
 
@@ -237,7 +237,7 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
         found[name] = races.train(folder / name.replace(" ", "_").replace("/", "_"), own, asked)
     rows = [
         [name, f"{r.metrics['steps']}", f"{r.metrics['training_seconds']:.1f}", f"{r.value('known', 'psnr'):.2f}",
-         f"{r.value('novel', 'psnr'):.2f}", *(either(seconds_to(r, target)) for target in TARGETS)]
+         f"{r.value('novel', 'psnr'):.2f}", *(reached(seconds_to(r, target)) for target in TARGETS)]
         for name, r in found.items()
     ]  # fmt: skip
     untrained = {k: f["psnr"] for k, f in peers.measure(scene).items() if not isinstance(f, str)}
@@ -248,7 +248,7 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     shown(f"{scene.name}, {scene.width} x {scene.height}, {threads} threads", columns, rows)
     for name, r in found.items():
         keys = ("training_seconds", "known_psnr", "novel_psnr")
-        shown(f"{name}: PSNR along the way", list(keys), [[either(row[k]) for k in keys] for row in r.rows])
+        shown(f"{name}: PSNR along the way", list(keys), [[reached(row[k]) for k in keys] for row in r.rows])
     ends = {name: r.value("novel", "psnr") for name, r in found.items()}
     published, tuned, *parts = ends
     for slow, part in ((published, parts[0]), (tuned, parts[1])):
@@ -282,12 +282,13 @@ def scaling(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
             measured[size] = races.costs(run, SCALING_TARGET)
         keys = ("seconds", "ms", "MB")
         powers = {key: races.exponent(list(measured), [m[key] for m in measured.values()]) for key in keys}
-        rows = [[str(size), *(either(m[key]) for key in keys)] for size, m in measured.items()]
+        rows = [[str(size), *(reached(m[key]) for key in keys)] for size, m in measured.items()]
         rows.append(["exponent", *("" if powers[key] is None else f"{powers[key]:.2f}" for key in keys)])
         shown(f"by {what}", [what, f"s to {SCALING_TARGET} dB", "ms a step", "peak MB"], rows)
         result[what] = {"measured": measured, "exponents": powers}
-    result["a step"] = races.step_work(whole.height, whole.width, 8, 65_536)
-    shown("One step, 8 layers, 65,536 pixels", ["", *result["a step"]],
+    layers, pixels = run.setting("model.layers") * run.setting("model.sets"), run.setting("optim.batch_pixels")
+    result["a step"] = races.step_work(whole.height, whole.width, layers, pixels)
+    shown(f"One step, {layers} layers, {pixels} pixels", ["", *result["a step"]],
           [["model=fast", *(f"{value:.3g}" for value in result["a step"].values())]])  # fmt: skip
     write_json(folder / "bench.json", result)
     return result
