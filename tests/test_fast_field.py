@@ -123,15 +123,15 @@ def test_error_and_penalty_together_are_the_mean_error_of_the_sets():
 
 
 def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump():
-    field = scramble(make(40, 48, views=6))
-    codes = torch.randn(6, M)
-    views = torch.rand(6, 40, 48, 3)
+    field = scramble(make(40, 48, views=12))
+    codes = torch.randn(12, M)
+    views = torch.rand(12, 40, 48, 3)
     field.calibrate(codes)
     field.finish(views, codes)
     field.eval()
-    for k in range(6):
-        # noise has variance 1/12; a neighbour's share of it is below a fifth at a known view
-        assert (draw(field, codes[k], 40, 48) - views[k]).square().mean() < 2 / 12 / 25
+    assert field.finishing(12) == 12
+    for k in range(12):
+        assert torch.allclose(draw(field, codes[k], 40, 48), views[k], atol=2e-3)  # remainders are kept in half precision
     frames = [draw(field, lerp(codes[0], codes[1], t / 200), 40, 48) for t in range(201)]
     steps = torch.tensor([(b - a).abs().mean() for a, b in zip(frames, frames[1:], strict=False)])  # noqa: RUF007
     assert steps.max() < 10 * steps.mean()

@@ -94,16 +94,17 @@ class Budget(L.Callback):
     """Ends the run after so many steps or training seconds, and lays the cosine schedule over whichever is given.
 
     The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end. The
-    field is told where the budget stands before each step, and finishes on the clock: see `fields.field.Field`.
+    field is told where the budget stands before each step, and finishes on the clock: see `fields.field.Field`. The
+    seconds that this will take are kept back from the steps, but half of the training seconds at most.
     """
 
     def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
-        self.cfg, self.clock = cfg, clock
+        self.cfg, self.clock, self.kept_back = cfg, clock, 0.0
 
     def progress(self, trainer: L.Trainer) -> float:
         """The share of the budget that is used, in [0, 1]."""
-        if self.cfg.training_seconds is not None:
-            return min(self.clock.seconds / self.cfg.training_seconds, 1.0)
+        if (seconds := self.cfg.training_seconds) is not None:
+            return min(self.clock.seconds / (seconds - min(self.kept_back, seconds / 2)), 1.0)
         return min(trainer.global_step / self.cfg.steps, 1.0)
 
     def factor(self, progress: float) -> float:
@@ -112,6 +113,10 @@ class Budget(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         self.clock.start()
+        store = trainer.datamodule.store
+        views = module.field.finishing(store.n)
+        if views and self.cfg.training_seconds is not None and not self.kept_back:
+            self.kept_back = views * seconds_to_draw(module, store.height, store.width)
         trainer.should_stop = agreed(trainer, self.progress(trainer)) >= 1
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
@@ -132,10 +137,21 @@ class Budget(L.Callback):
         self.clock.stop()
 
     def state_dict(self) -> dict[str, float]:
-        return self.clock.state_dict()
+        return {**self.clock.state_dict(), "kept_back": self.kept_back}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
         self.clock.load_state_dict(state)
+        self.kept_back = state["kept_back"]
+
+
+def seconds_to_draw(module: ViewInterpolator, height: int, width: int, chunk_pixels: int = 65_536) -> float:
+    """Seconds that drawing one view takes, from drawing one chunk of it for the second time: the first has more to do."""
+    rows = min(height, max(1, chunk_pixels // width))
+    for _ in range(2):
+        begin = time.perf_counter()
+        draw(module.field, module.codes.weight[0].detach(), rows, width, chunk_pixels).sum().item()
+        took = time.perf_counter() - begin
+    return took * height / rows
 
 
 class InterpolationLoss(L.Callback):
@@ -238,7 +254,9 @@ class ErrorClock(L.Callback):
         if now < self.next or trainer.should_stop:
             return
         if not self.longest:
-            self.longest = self._estimate(trainer, module)
+            with self.clock.paused(), trainer.strategy.precision_plugin.forward_context():
+                one = seconds_to_draw(module, self.scene.height, self.scene.width, self.cfg.chunk_pixels)
+            self.longest = one * (self.scene.n + len(self.scene.probes["novel"]))
         if self.spent + self.longest >= self.cfg.max_share * now:
             self.next = (self.spent + self.longest) / self.cfg.max_share if self.cfg.max_share else math.inf
             return
@@ -272,14 +290,6 @@ class ErrorClock(L.Callback):
             took = time.perf_counter() - begin
             self.spent, self.longest = self.spent + took, max(self.longest, took)
         return found
-
-    def _estimate(self, trainer: L.Trainer, module: ViewInterpolator) -> float:
-        """Seconds that a measurement will take, from drawing one view."""
-        with self.clock.paused(), trainer.strategy.precision_plugin.forward_context():
-            begin = time.perf_counter()
-            z = module.codes.weight[0].detach()
-            draw(module.field, z, self.scene.height, self.scene.width, self.cfg.chunk_pixels).sum().item()
-            return (time.perf_counter() - begin) * (self.scene.n + len(self.scene.probes["novel"]))
 
     def _seen(self, kind: str, index: int, image: Tensor, target: Tensor) -> None:
         for listener in self.listeners:

@@ -42,8 +42,7 @@ from viinter.fields.field import Field
 COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
 MOST = 100, 300  # steps at each of the coarse levels, and at half size
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
-NEAREST = 4  # known views that share in a remainder
-REACH = 0.7  # how far a known view's remainder reaches, in distances to the view nearest to it
+NEAREST = 8  # known views that share in a remainder
 
 
 class FastField(Field):
@@ -78,7 +77,6 @@ class FastField(Field):
         shape = (views, 3, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], 4 * motion))
-        self.register_buffer("reach", torch.zeros(shape[0]))
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.level, self.decision = count - 1, 1.0
 
@@ -221,6 +219,9 @@ class FastField(Field):
         held, self.held = self.held, None
         return held
 
+    def finishing(self, n: int) -> int:
+        return n if len(self.remainder) else 0
+
     @torch.no_grad()
     def finish(self, views: Tensor, codes: Tensor) -> None:
         """Keeps what the layers leave over of the known views [n, H, W, 3] with codes [n, M]."""
@@ -239,23 +240,30 @@ class FastField(Field):
                 self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).to(self.remainder.dtype)
         self.train(was)
         self.places.copy_(self.place(codes))
-        apart = torch.cdist(self.places, self.places).fill_diagonal_(math.inf).amin(1)
-        # two views at one place would reach nowhere; all of them at one place still share their remainders there
-        apart = apart.clamp_min(0.1 * apart.mean()).clamp_min(1e-12)
-        self.reach.copy_(REACH * apart if len(views) > 1 else torch.ones(1))
         self.finished.fill_(True)
 
-    def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, disparity: Tensor) -> Tensor:
-        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place` with mean `disparity` [V, P].
+    def shares(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """How much each of the `N` known views nearest to `place` [V, 4 K] gives of its remainder: [V, N], summing to
+        1, and which views these are, [V, N].
 
-        A known view's share falls with the square of its distance in motion; what the first view that is left out
-        would have had is taken from all, so that a view enters and leaves a path without a jump.
+        A known view's share falls with its distance in motion, and is all of it at its own place; it is gone at the
+        distance of the first view that is left out, so that a view enters and leaves a path without a jump (Shepard's
+        interpolation, as Franke and Nielson 1980 made it local).
         """
-        near = torch.exp(-torch.cdist(place, self.places).square() / self.reach.square())
-        shares, views = near.topk(min(NEAREST + 1, near.shape[1]), -1)
-        if near.shape[1] > NEAREST:
-            shares, views = (shares - shares[:, -1:])[:, :-1], views[:, :-1]
-        shares = shares / shares.sum(-1, keepdim=True).clamp_min(1e-12)
+        apart = torch.cdist(place, self.places, compute_mode="donot_use_mm_for_euclid_dist")  # that would be inexact
+        apart = apart.clamp_min(1e-6)  # two views may be at one place
+        apart, views = apart.topk(min(NEAREST + 1, apart.shape[1]), largest=False)
+        if apart.shape[1] > NEAREST:
+            near = (1 / apart - 1 / apart[:, -1:])[:, :-1]
+            near, views = near.clamp_min(1e-12), views[:, :-1]  # all views may be at one distance
+        else:
+            near = 1 / apart
+        near = near**1.5
+        return near / near.sum(-1, keepdim=True), views
+
+    def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, disparity: Tensor) -> Tensor:
+        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place` with mean `disparity` [V, P]."""
+        shares, views = self.shares(place)
         _, _, height, width = self.remainder.shape
         size = xy.new_tensor([[width], [height]])
         scale = size / (size - 1).clamp_min(1)

@@ -30,6 +30,10 @@ class Field(nn.Module):
         """A factor on the learning rate of each of `parameter_groups`, after `at`."""
         return [1.0]
 
+    def finishing(self, n: int) -> int:
+        """As many views as `finish` will draw, of `n` known ones: the budget keeps the seconds for it back."""
+        return 0
+
     def finish(self, views: Tensor, codes: Tensor) -> None:
         """Called once, after the last step, with the known views [n, H, W, 3] and their codes [n, M]."""
 
