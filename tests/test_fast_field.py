@@ -131,7 +131,7 @@ def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump
     field.eval()
     assert field.finishing(12) == 12
     for k in range(12):
-        assert torch.allclose(draw(field, codes[k], 40, 48), views[k], atol=2e-3)  # remainders are kept in half precision
+        assert torch.allclose(draw(field, codes[k], 40, 48), views[k], atol=2e-3)  # kept in half precision
     frames = [draw(field, lerp(codes[0], codes[1], t / 200), 40, 48) for t in range(201)]
     steps = torch.tensor([(b - a).abs().mean() for a, b in zip(frames, frames[1:], strict=False)])  # noqa: RUF007
     assert steps.max() < 10 * steps.mean()

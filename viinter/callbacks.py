@@ -145,7 +145,7 @@ class Budget(L.Callback):
 
 
 def seconds_to_draw(module: ViewInterpolator, height: int, width: int, chunk_pixels: int = 65_536) -> float:
-    """Seconds that drawing one view takes, from drawing one chunk of it for the second time: the first has more to do."""
+    """Seconds that drawing one view takes, from drawing one chunk of it twice: the first time has more to do."""
     rows = min(height, max(1, chunk_pixels // width))
     for _ in range(2):
         begin = time.perf_counter()
