@@ -365,6 +365,25 @@ def test_finishing_takes_at_most_half_of_a_budget_from_the_steps(make_config, tm
     assert train(make_config(**{"optim.training_seconds": 2.0}), tmp_path)["steps"] == 1.0 / 0.25
 
 
+def test_seconds_that_a_field_has_no_use_for_are_left_over(make_config, tmp_path, monkeypatch):
+    """The schedule is laid over the steps that are of use; a budget of steps is kept."""
+    passes = []
+
+    def enough(field, steps_per_pass):
+        passes.append(steps_per_pass)
+        return 8
+
+    monkeypatch.setattr(PaperField, "enough", enough)
+    found = rates(monkeypatch)
+    cfg = make_config(**{"optim.lr": 1e-3, "optim.lr_decay": 0.1, "optim.training_seconds": 1000.0})
+    metrics = train(cfg, tmp_path / "seconds")
+    assert metrics["steps"] == 8
+    assert found == pytest.approx([cosine(1e-3, 0.1, step / 8) for step in range(8)], rel=0.01)
+    pixels = metrics["views"] * metrics["height"] * metrics["width"]
+    assert passes == [pixels / cfg.optim.batch_pixels]
+    assert train(make_config(**{"optim.steps": 9}), tmp_path / "steps")["steps"] == 9
+
+
 def rates(monkeypatch):
     found, step = [], ViewInterpolator.training_step
 

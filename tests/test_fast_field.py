@@ -76,6 +76,11 @@ def test_in_long_runs_coarse_levels_end_after_so_many_steps():
     assert field.level == 3
 
 
+def test_enough_are_so_many_steps_and_so_many_passes():
+    field = make(views=0)
+    assert [field.enough(steps_per_pass) for steps_per_pass in (0.1, 25, 25.5, 100)] == [1500, 1500, 1530, 6000]
+
+
 def test_only_the_level_in_training_gets_a_gradient_and_whatever_moves_slows_down():
     field = make(128, 128)
     xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)

@@ -95,16 +95,18 @@ class Budget(L.Callback):
 
     The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end. The
     field is told where the budget stands before each step, and finishes on the clock: see `fields.field.Field`. The
-    seconds that this will take are kept back from the steps, but half of the training seconds at most.
+    seconds that this will take are kept back from the steps, but half of the training seconds at most. Training
+    seconds that are more than the field has a use for are left over.
     """
 
     def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
-        self.cfg, self.clock, self.kept_back = cfg, clock, 0.0
+        self.cfg, self.clock, self.kept_back, self.enough = cfg, clock, 0.0, math.inf
 
     def progress(self, trainer: L.Trainer) -> float:
         """The share of the budget that is used, in [0, 1]."""
         if (seconds := self.cfg.training_seconds) is not None:
-            return min(self.clock.seconds / (seconds - min(self.kept_back, seconds / 2)), 1.0)
+            used = self.clock.seconds / (seconds - min(self.kept_back, seconds / 2))
+            return min(max(used, trainer.global_step / self.enough), 1.0)
         return min(trainer.global_step / self.cfg.steps, 1.0)
 
     def factor(self, progress: float) -> float:
@@ -114,6 +116,7 @@ class Budget(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         self.clock.start()
         store = trainer.datamodule.store
+        self.enough = module.field.enough(store.n * store.height * store.width / self.cfg.batch_pixels)
         views = module.field.finishing(store.n)
         if views and self.cfg.training_seconds is not None and not self.kept_back:
             self.kept_back = views * seconds_to_draw(module, store.height, store.width)

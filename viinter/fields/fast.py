@@ -41,6 +41,7 @@ from viinter.fields.field import Field
 
 COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
 MOST = 100, 300  # steps at each of the coarse levels, and at half size
+ENOUGH = 1500, 60  # steps, and passes over the known pixels: after both more time only learns known views by heart
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
 
@@ -218,6 +219,10 @@ class FastField(Field):
         """
         held, self.held = self.held, None
         return held
+
+    def enough(self, steps_per_pass: float) -> float:
+        steps, passes = ENOUGH
+        return max(steps, passes * steps_per_pass)
 
     def finishing(self, n: int) -> int:
         return n if len(self.remainder) else 0

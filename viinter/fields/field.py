@@ -5,6 +5,7 @@ Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from torch import Tensor, nn
@@ -29,6 +30,10 @@ class Field(nn.Module):
     def rates(self) -> list[float]:
         """A factor on the learning rate of each of `parameter_groups`, after `at`."""
         return [1.0]
+
+    def enough(self, steps_per_pass: float) -> float:
+        """Steps that are of use, where a pass over all known pixels takes `steps_per_pass`: seconds beyond are left."""
+        return math.inf
 
     def finishing(self, n: int) -> int:
         """As many views as `finish` will draw, of `n` known ones: the budget keeps the seconds for it back."""
