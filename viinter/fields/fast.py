@@ -183,11 +183,11 @@ class FastField(Field):
         place = self.place(z)
         phi = self.basis(xy)
         a, b = self.carry(phi, place).split(2, 1)
-        u = (xy / self.margin + a)[None] + self.disparity[:, None, None, None] * b[None]
+        u = torch.addcmul(xy / self.margin + a, self.disparity[:, None, None, None], b)
         disparity = self.disparity[:, None, None]
         if self.level >= min(2, len(self.colours) - 1):
             delta = sample(self.delta, u)[:, 0]
-            u, disparity = u + delta[:, :, None] * b[None], disparity + delta
+            u, disparity = torch.addcmul(u, delta[:, :, None], b), disparity + delta
         read = sample(self.textures(), u).unflatten(0, (-1, self.sets))
         weight = torch.softmax(self.sharpness * read[:, :, 3], 0)
         each = (weight[:, :, None] * read[:, :, :3]).sum(0)  # [S, 3, V, P]
@@ -271,15 +271,16 @@ class FastField(Field):
         shares, views = self.shares(place)
         _, _, height, width = self.remainder.shape
         size = xy.new_tensor([[width], [height]])
-        scale = size / (size - 1).clamp_min(1)
-        total = 0
+        scale = size / (size - 1).clamp_min(1)  # pixel centres at both ends, as grid_sample counts
+        here = (xy + 1) * scale - 1
+        by = self.margin * torch.cat([scale, scale])
+        total = torch.zeros_like(xy[:, :1]).repeat(1, 3, 1)
         for share, view in zip(shares.unbind(-1), views.unbind(-1), strict=True):
-            a, b = (self.margin * self.carry(phi, place - self.places[view])).split(2, 1)  # from there to here
-            there = xy + a + disparity[:, None] * b
-            there = (there + 1) * scale - 1  # pixel centres at both ends, as grid_sample counts
+            a, b = (by * self.carry(phi, place - self.places[view])).split(2, 1)  # from there to here
+            there = torch.addcmul(here + a, disparity[:, None], b)
             read = sample(self.remainder[view].to(there.dtype), there[:, None])[:, :, 0]
-            total = total + share[:, None, None] * read.movedim(1, -1)
-        return total
+            total.addcmul_(share[:, None, None], read)
+        return total.movedim(1, -1)
 
 
 def pyramid(levels: list[Tensor]) -> Tensor:
