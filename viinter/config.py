@@ -157,7 +157,7 @@ class FastModel(ModelConfig):
 @dataclass
 class OptimConfig:
     steps: int = setting(300_000, "training steps, unless training_seconds is given")
-    training_seconds: float | None = setting(None, "budget in training seconds in place of steps; model=fast may end sooner")
+    training_seconds: float | None = setting(None, "budget in seconds, in place of steps; model=fast may end sooner")
     lr: float = setting(1e-5, "learning rate of Adam at the start (supplement: 1e-5)")
     lr_decay: float = setting(0.1, "rate at the end, as a share of the first; cosine between (supplement: 0.1)")
     beta2: float = setting(0.999, "Adam's decay of squared gradients (PyTorch's default)")
