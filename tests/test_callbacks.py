@@ -365,7 +365,7 @@ def test_finishing_takes_at_most_half_of_a_budget_from_the_steps(make_config, tm
     assert train(make_config(**{"optim.training_seconds": 2.0}), tmp_path)["steps"] == 1.0 / 0.25
 
 
-def test_seconds_that_a_field_has_no_use_for_are_left_over(make_config, tmp_path, monkeypatch):
+def test_seconds_that_a_field_has_no_use_for_are_left_over(make_config, tmp_path, monkeypatch, capsys):
     """The schedule is laid over the steps that are of use; a budget of steps is kept."""
     passes = []
 
@@ -375,8 +375,10 @@ def test_seconds_that_a_field_has_no_use_for_are_left_over(make_config, tmp_path
 
     monkeypatch.setattr(PaperField, "enough", enough)
     found = rates(monkeypatch)
-    cfg = make_config(**{"optim.lr": 1e-3, "optim.lr_decay": 0.1, "optim.training_seconds": 1000.0})
+    values = {"optim.lr": 1e-3, "optim.lr_decay": 0.1, "optim.training_seconds": 1000.0, "logging.progress": True}
+    cfg = make_config(**values)
     metrics = train(cfg, tmp_path / "seconds")
+    assert "ended before 1000 s" in capsys.readouterr().out
     assert metrics["steps"] == 8
     assert found == pytest.approx([cosine(1e-3, 0.1, step / 8) for step in range(8)], rel=0.01)
     pixels = metrics["views"] * metrics["height"] * metrics["width"]

@@ -153,6 +153,8 @@ def train(
         raise
     except (UserError, OSError) as error:
         raise UserError(f"{error}; then go on with: {again}") from error
+    if cfg.optim.training_seconds is not None and trainer.global_step >= budget.enough:
+        console.print(f"ended before {cfg.optim.training_seconds:g} s: more steps only learn known views by heart")
     console.print(summary(metrics, run_dir), soft_wrap=True)
     return metrics
 
