@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
+import re
 import statistics
 import tempfile
 import time
@@ -234,7 +235,7 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     found = {}
     for name, own in races.methods(cfg.optim.training_seconds).items():
         Console().rule(name)
-        found[name] = races.train(folder / name.replace(" ", "_").replace("/", "_"), own, asked)
+        found[name] = races.train(folder / re.sub(r"\W+", "_", name), own, asked)
     rows = [
         [name, f"{r.metrics['steps']}", f"{r.metrics['training_seconds']:.1f}", f"{r.value('known', 'psnr'):.2f}",
          f"{r.value('novel', 'psnr'):.2f}", *(reached(seconds_to(r, target)) for target in TARGETS)]

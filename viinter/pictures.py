@@ -19,9 +19,11 @@ from viinter.views import draw
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
 STRIP = 5
+ROUNDING = (1 / 255) ** 2 / 12  # mean squared error of rounding to 8 bits
 
 
 def write_strip(file: Path, field: nn.Module, codes: Tensor, ends: tuple[int, int], size: tuple[int, int],
@@ -37,6 +39,13 @@ def write_film(file: Path, field: nn.Module, codes: Tensor, size: tuple[int, int
     video.write_mp4(file, (frame / 255 for frame in there + there[-2:0:-1]), fps=30)
 
 
+def end_at_rounding(axes: Axes) -> None:
+    """Errors smaller than that of an 8-bit image leave the plot: exact views would take most of a log axis."""
+    bottom, top = axes.get_ylim()
+    if bottom < ROUNDING < top:
+        axes.set_ylim(bottom=ROUNDING)
+
+
 def plot_error(file: Path, rows: list[dict[str, Any]], title: str) -> None:
     """MSE against training seconds, both on log axes, known views and probes apart."""
     figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
@@ -47,6 +56,7 @@ def plot_error(file: Path, rows: list[dict[str, Any]], title: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel="training seconds", ylabel="mean squared error", title=title)
     axes.grid(True, which="both", alpha=0.3)
     if axes.lines:
+        end_at_rounding(axes)
         axes.legend()
         # a secondary axis with a function that falls would be labelled upside down (matplotlib 3.11)
         right = axes.secondary_yaxis("right")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from viinter import image
 from viinter.evidence import BUDGET, curve, methods
-from viinter.pictures import STRIP
+from viinter.pictures import STRIP, end_at_rounding
 from viinter.runs import Run
 
 matplotlib.use("Agg")
@@ -109,6 +109,7 @@ def error_curves(runs: list[Run], flat: dict[str, float]) -> Figure:
         axes.grid(True, which="both", alpha=0.3)
     both[0].set_ylabel("mean squared error")
     if named := [axes for axes in both if axes.lines]:  # a scene without probes has known views alone
+        end_at_rounding(both[0])  # both share the axis
         named[0].legend(fontsize=6)
     return _signed(figure, runs)
 

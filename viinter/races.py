@@ -50,7 +50,7 @@ def train(folder: Path, own: Sequence[str], common: Sequence[str]) -> Run:
             raise UserError(f"{folder} holds {both}; choose another folder")
         command = [f"resume={folder}"]
     else:
-        command = [*asked, f"hydra.run.dir={folder}"]
+        command = [*asked, f"hydra.run.dir='{folder}'"]
     if not (folder / "metrics.json").exists():
         command = [sys.executable, "-m", "viinter.train", *command]
         if subprocess.run(command).returncode:

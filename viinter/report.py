@@ -95,7 +95,8 @@ def against_time(of: list[Run]) -> list[Table | Picture | str]:
     # a line in a plot of one scene alone
     one = next(iter(named.values())) if len(named) == 1 else {}
     mse, psnr = ({k: f[key] for k, f in one.items() if not isinstance(f, str)} for key in ("mse", "psnr"))
-    curves = Picture("Error against time", lambda: plots.error_curves(of, mse), "Median over seeds, range shaded.")
+    below = "Median over seeds, range shaded, down to the error of 8 bits."
+    curves = Picture("Error against time", lambda: plots.error_curves(of, mse), below)
     work = Picture("Work and precision", lambda: plots.work_precision(of, psnr), "Each budget had its own schedule.")
     budgets = {tuple(run.setting(key) for key in evidence.BUDGET[1:]) for run in of}
     return [
