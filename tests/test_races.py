@@ -89,8 +89,9 @@ def test_bench_fast_tells_what_each_reached_and_what_needs_no_training(make_conf
 
 def test_bench_fast_as_it_is_typed(tmp_path):
     root = grid(tmp_path / "grid", 2)
-    done = typed("-m", "viinter.bench", "fast", "scene=planar", f"scene.root={root}", "scale=smoke", "threads=1",
-                 "logging.pictures=false", "optim.training_seconds=0.3", "hydra.run.dir=bench", cwd=tmp_path)  # fmt: skip
+    settings = ["scene=planar", f"scene.root={root}", "scale=smoke", "threads=1", "logging.pictures=false"]
+    done = typed("-m", "viinter.bench", "fast", *settings, "optim.training_seconds=0.3", "hydra.run.dir=bench",
+                 cwd=tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "fast, 1/60 of the time:" in done.stdout
     assert len(list((tmp_path / "bench").glob("*/metrics.json"))) == 5

@@ -11,6 +11,7 @@ import itertools
 import multiprocessing
 import re
 import statistics
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -219,7 +220,8 @@ def shown(title: str, columns: list[str], rows: list[list[str]]) -> None:
         table.add_column(column, justify="right" if k else "left")
     for row in rows:
         table.add_row(*row)
-    Console().print(table)
+    # in a file nothing need be wrapped
+    (Console() if sys.stdout.isatty() else Console(width=160)).print(table)
 
 
 def reached(value: float | None, digits: int = 1) -> str:
