@@ -274,7 +274,7 @@ class FastField(Field):
         scale = size / (size - 1).clamp_min(1)  # pixel centres at both ends, as grid_sample counts
         here = (xy + 1) * scale - 1
         by = self.margin * torch.cat([scale, scale])
-        total = torch.zeros_like(xy[:, :1]).repeat(1, 3, 1)
+        total = xy.new_zeros(len(xy), 3, xy.shape[-1])
         for share, view in zip(shares.unbind(-1), views.unbind(-1), strict=True):
             a, b = (by * self.carry(phi, place - self.places[view])).split(2, 1)  # from there to here
             there = torch.addcmul(here + a, disparity[:, None], b)
