@@ -11,7 +11,7 @@ import pytest
 import torch
 from conftest import WITH_TOWER, checkpoint_of
 
-from viinter import callbacks, checkpoints, features
+from viinter import callbacks, checkpoints, features, pictures, scenes
 from viinter.callbacks import Budget, Clock, ErrorClock, InterpolationLoss, RenormalizeCodes, ViewLogger
 from viinter.checkpoints import Interruption, SaveCheckpoint
 from viinter.config import InterpolationConfig, OptimConfig, Patches
@@ -468,7 +468,7 @@ def test_evaluations_take_no_more_than_their_share_of_the_training_seconds(
 ):
     takes(monkeypatch, stopwatch, callbacks, "draw", 1 / 32)
     takes(monkeypatch, stopwatch, callbacks, "measure", 21 / 32)  # 9 known views, 12 probes
-    spaced = {"evaluation.first_seconds": 0.25, "evaluation.factor": 1.01, "evaluation.max_share": 0.25}
+    spaced = {"evaluation.first_seconds": 0.25, "evaluation.factor": 1.01, "evaluation.max_share": 0.5}
     train(make_config(**{"optim.steps": 60, **spaced}), tmp_path)
     during = [float(row["training_seconds"]) for row in rows(tmp_path)[:-1]]
     assert len(during) > 3
@@ -479,6 +479,39 @@ def test_evaluations_take_no_more_than_their_share_of_the_training_seconds(
 def test_with_no_share_there_is_one_evaluation_at_the_end(make_config, tmp_path):
     train(make_config(**{"evaluation.first_seconds": 1e-6, "evaluation.max_share": 0.0}), tmp_path)
     assert [int(row["step"]) for row in rows(tmp_path)] == [6]
+
+
+def test_the_last_measurement_of_views_that_take_long_to_draw_takes_evenly_spaced_ones(
+    make_config, tmp_path, monkeypatch, capsys
+):
+    """Four seconds a view: the 40 s are enough for a third of 9 known views and 12 probes, 20 s for all the 4 cells
+    and for five frames of the film."""
+    monkeypatch.setattr(callbacks, "seconds_to_draw", lambda *_: 4.0)
+    films = []
+    monkeypatch.setattr(pictures, "write_film", lambda file, field, codes, *_: films.append((len(codes), _[-1])))
+    shown = {"logging.pictures": True, "logging.progress": True, "logging.frames": 60}
+    cfg = make_config(**{**shown, "evaluation.first_seconds": 1e-9})
+    found = train(cfg, tmp_path)
+    counts = {kind: len(found[kind]["per_view"]) for kind in ("known", "novel", "novel_cells")}
+    assert counts == {"known": 3, "novel": 4, "novel_cells": 4}
+    assert found["measured_every"] == {"known": 3, "novel": 3, "novel_cells": 1, "novel_quarters": 1}
+    names = list(scenes.load(cfg.scene).names)
+    assert list(found["known"]["per_view"]) == [names[1], names[4], names[7]]
+    assert films == [(5, 30 * 5 / 60)]
+    assert len(rows(tmp_path)) == 1
+    said = capsys.readouterr().out
+    assert "(3 views, one of 3)" in said
+    assert f"python -m viinter.evaluate run={tmp_path}" in said
+
+
+def test_the_last_measurement_may_take_what_is_left_of_its_share(make_config, tmp_path, stopwatch, monkeypatch):
+    """Ten seconds of training and a share of 84 / 10: all 21 views in 84 s; none on the way, for half of it is less."""
+    monkeypatch.setattr(callbacks, "seconds_to_draw", lambda *_: 4.0)
+    share = {"evaluation.first_seconds": 0.25, "evaluation.max_share": 8.4}
+    found = train(make_config(**{"optim.steps": 40, **share}), tmp_path)
+    assert [int(row["step"]) for row in rows(tmp_path)] == [40]
+    assert found["measured_every"]["novel"] == 1
+    assert len(found["novel"]["per_view"]) == 12
 
 
 def test_the_last_row_is_the_end_of_the_run_as_in_the_metrics(make_config, tmp_path):

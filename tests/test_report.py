@@ -5,13 +5,14 @@ import json
 import re
 import shutil
 import statistics
+from pathlib import Path
 
 import pytest
 import torch
 from conftest import keep_config
 
 from viinter import comparisons, image, page, report, runs
-from viinter.comparisons import cell, published
+from viinter.comparisons import cell, every_run, published
 from viinter.config import UserError
 from viinter.page import Section, Table
 from viinter.runs import Run
@@ -60,6 +61,11 @@ def test_a_cell_is_the_mean_over_seeds_with_the_range():
     assert cell([run_with(20.0), run_with(21.0), run_with(25.0)], "novel", "psnr") == "22.00 (20.00 to 25.00)"
     assert cell([run_with(20.0)], "novel", "psnr") == "20.00"
     assert cell([run_with(20.0)], "novel", "ssim") == "0.500"
+    some = run_with(20.0)
+    some.metrics["measured_every"] = {"novel": 3}
+    assert cell([run_with(22.0), some], "novel", "psnr") == "21.00 (20.00 to 22.00) [one view of 3]"
+    some.folder, some.metrics["known"] = Path("sweep/0"), {"psnr": 21.0, "ssim": 0.5}
+    assert every_run([some], []).notes == ["sweep/0 measured one view of 3 at its end"]
 
 
 def test_a_cell_without_a_number_says_why():

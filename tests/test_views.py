@@ -58,6 +58,10 @@ def test_measure_draws_known_views_from_their_codes_and_probes_from_their_mixes(
     assert found["known"]["mse"] < 1e-12
     assert found["novel"]["mse"] < 1e-12
     assert seen == [("known", 0), ("known", 1), ("novel", 0)]
+    some = measure(field, codes, scene, every=2)
+    assert list(some["known"]["per_view"]) == ["b.png"]
+    assert some["novel"] == found["novel"]
+    assert len(measure(field, codes, scene, every=100)["known"]["per_view"]) == 1
     probes["novel"][0].target += 0.1
     assert measure(field, codes, scene, ["novel"])["novel"]["mse"] > 1e-3
 

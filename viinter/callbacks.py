@@ -33,6 +33,8 @@ from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
 from viinter.views import draw, measure, pixel_grid
 
+LAST_SECONDS = 40.0  # that the last measurement may take however short a run was
+
 CSV_COLUMNS = [
     "step", "training_seconds", "wall_seconds", "known_mse", "known_psnr", "known_ssim", "novel_mse", "novel_psnr",
     "novel_ssim", "code_norm_min", "code_norm_max", "lr",
@@ -241,15 +243,21 @@ class ErrorClock(L.Callback):
     """Error against run time: measures known views and standard probes at geometrically spaced training seconds.
 
     The first measurement comes at `first_seconds`, each next when the training seconds have grown by `factor`, and
-    none if all of them together would take more than `max_share` of the training seconds; one at the end always.
-    The clock stands still meanwhile. Each gives a row of `error_vs_time.csv` and scalars in TensorBoard.
+    none if all of them together would take more than half of `max_share` of the training seconds. The clock stands
+    still meanwhile. Each gives a row of `error_vs_time.csv` and scalars in TensorBoard.
+
+    One comes at the end always. Where a view takes so long to draw that it would take more than is left of
+    `max_share`, and more than `LAST_SECONDS`, only one of `every[kind]` views of each kind, evenly spaced, is measured
+    then (`viinter.evaluate` measures all of them); so too for the probes beyond the standard ones, and `film_frames`.
     """
 
     def __init__(self, cfg: EvaluationConfig, scene: Scene, clock: Clock, run_dir: Path) -> None:
         self.cfg, self.scene, self.clock, self.file = cfg, scene, clock, run_dir / "error_vs_time.csv"
         self.rows: list[dict[str, Any]] = []
         self.next, self.spent, self.longest = cfg.first_seconds, 0.0, 0.0
+        self.one = 0.0  # seconds for a view
         self.final: dict[str, dict] = {}
+        self.every: dict[str, int] = {}
         self.listeners: list[Callable[[str, int, Tensor, Tensor], None]] = []
 
     def on_train_batch_end(self, trainer: L.Trainer, module: ViewInterpolator, *_: Any) -> None:
@@ -257,11 +265,11 @@ class ErrorClock(L.Callback):
         if now < self.next or trainer.should_stop:
             return
         if not self.longest:
-            with self.clock.paused(), trainer.strategy.precision_plugin.forward_context():
-                one = seconds_to_draw(module, self.scene.height, self.scene.width, self.cfg.chunk_pixels)
-            self.longest = one * (self.scene.n + len(self.scene.probes["novel"]))
-        if self.spent + self.longest >= self.cfg.max_share * now:
-            self.next = (self.spent + self.longest) / self.cfg.max_share if self.cfg.max_share else math.inf
+            self._time_a_view(trainer, module)
+            self.longest = self.one * self._views("known", "novel")
+        share = self.cfg.max_share / 2
+        if self.spent + self.longest >= share * now:
+            self.next = (self.spent + self.longest) / share if share else math.inf
             return
         self.evaluate(trainer, module, ["known", "novel"])
         self.next = now * self.cfg.factor
@@ -269,19 +277,55 @@ class ErrorClock(L.Callback):
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         if self.rows and self.rows[-1]["step"] == trainer.global_step:
             self.rows.pop()
-        self.final = self.evaluate(trainer, module, ["known", *self.scene.probes])
+        self._time_a_view(trainer, module)  # not as it was in training: the field has finished since
+        standard, others = ["known", "novel"], [kind for kind in self.scene.probes if kind != "novel"]
+        left = self.cfg.max_share * self.clock.seconds - self.spent
+        every = self._every(standard, max(left, LAST_SECONDS))
+        self.final = self.evaluate(trainer, module, standard, every)
+        beyond = self._every(others, self._extra_seconds())
+        self.final |= self._measure(trainer, module, others, beyond)
+        self.every = dict.fromkeys(standard, every) | dict.fromkeys(others, beyond)
 
-    def evaluate(self, trainer: L.Trainer, module: ViewInterpolator, kinds: list[str]) -> dict[str, dict]:
+    def film_frames(self, asked: int) -> int:
+        """So many of the `asked` frames of a film that drawing them keeps to what a last measurement may take."""
+        return max(2, min(asked, int(self._extra_seconds() / max(self.one, 1e-9))))
+
+    def _extra_seconds(self) -> float:
+        return max(self.cfg.max_share / 5 * self.clock.seconds, LAST_SECONDS / 2)
+
+    def _views(self, *kinds: str) -> int:
+        return sum(self.scene.n if kind == "known" else len(self.scene.probes[kind]) for kind in kinds)
+
+    def _every(self, kinds: list[str], seconds: float) -> int:
+        return max(1, math.ceil(self.one * self._views(*kinds) / seconds))
+
+    def _time_a_view(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
+        with self.clock.paused(), trainer.strategy.precision_plugin.forward_context():
+            module.eval()
+            self.one = seconds_to_draw(module, self.scene.height, self.scene.width, self.cfg.chunk_pixels)
+            module.train()
+
+    def _measure(
+        self, trainer: L.Trainer, module: ViewInterpolator, kinds: list[str], every: int
+    ) -> dict[str, dict]:
+        if not kinds:
+            return {}
+        module.eval()
+        with trainer.strategy.precision_plugin.forward_context():
+            found = measure(
+                module.field, module.codes.weight.detach(), self.scene, kinds, self.cfg.chunk_pixels, self._seen, every
+            )
+        module.train()
+        return found
+
+    def evaluate(
+        self, trainer: L.Trainer, module: ViewInterpolator, kinds: list[str], every: int = 1
+    ) -> dict[str, dict]:
         """Measures and adds a row, with the clock standing still."""
         with self.clock.paused():
             begin = time.perf_counter()
             training, wall = self.clock.seconds, self.clock.wall_seconds
-            module.eval()
-            with trainer.strategy.precision_plugin.forward_context():
-                found = measure(
-                    module.field, module.codes.weight.detach(), self.scene, kinds, self.cfg.chunk_pixels, self._seen
-                )
-            module.train()
+            found = self._measure(trainer, module, kinds, every)
             norms = module.codes.norms()
             row = {"step": trainer.global_step, "training_seconds": training, "wall_seconds": wall}
             for kind in ("known", "novel"):
@@ -375,6 +419,7 @@ class ViewLogger(L.Callback):
     def _pictures(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         if not self.cfg.pictures:
             return
+        begin = time.perf_counter()
         board, step = trainer.logger.experiment, trainer.global_step
         for kind, pair in self.kept.items():
             board.add_image(f"views/{kind}_and_target", pair, step, dataformats="HWC")
@@ -389,6 +434,7 @@ class ViewLogger(L.Callback):
         module.train()
         board.add_image("views/interpolation", torch.cat(frames, 1).clamp(0, 1), step, dataformats="HWC")
         board.flush()
+        self.errors.spent += time.perf_counter() - begin
 
 
 def _shown(value: Any) -> bool | int | float | str:

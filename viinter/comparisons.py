@@ -33,6 +33,8 @@ def cell(runs: list[Run], kind: str, key: str) -> str:
     text = f"{statistics.fmean(values):.{digits}f}" if values else "-"
     if len(values) > 1:
         text += f" ({min(values):.{digits}f} to {max(values):.{digits}f})"
+    if (every := max((run.measured_every(kind) for run in runs), default=1)) > 1:
+        text += f" [one view of {every}]"
     missing = [run.missing for run in runs if run.missing]
     if not runs:
         return "- (no such job)"
@@ -185,7 +187,9 @@ def every_run(runs: list[Run], keys: list[str]) -> Table:
         line += [number(facts.get("code_length"), 3), str(facts.get("steps", "-"))]
         line += [number(facts.get(k), 0) for k in ("training_seconds", "wall_seconds", "peak_memory_mb")]
         rows.append([*line, run.missing or ""])
-    return Table("Every run", columns, rows)
+    some = [f"{run.folder.parent.name}/{run.folder.name} measured one view of {every} at its end"
+            for run in runs if (every := max(run.measured_every(kind) for kind in ("known", "novel"))) > 1]  # fmt: skip
+    return Table("Every run", columns, rows, some)
 
 
 def number(value: float | None, digits: int) -> str:

@@ -33,10 +33,12 @@ def write_strip(file: Path, field: nn.Module, codes: Tensor, ends: tuple[int, in
     image.write(file, torch.cat(frames, 1).clamp(0, 1).cpu())
 
 
-def write_film(file: Path, field: nn.Module, codes: Tensor, size: tuple[int, int], chunk_pixels: int) -> None:
+def write_film(
+    file: Path, field: nn.Module, codes: Tensor, size: tuple[int, int], chunk_pixels: int, fps: float
+) -> None:
     """`interpolation.mp4` of the codes [F, M], there and back again, so that it plays without a jump."""
     there = [draw(field, z, *size, chunk_pixels).clamp(0, 1).mul(255).round().to("cpu", torch.uint8) for z in codes]
-    video.write_mp4(file, (frame / 255 for frame in there + there[-2:0:-1]), fps=30)
+    video.write_mp4(file, (frame / 255 for frame in there + there[-2:0:-1]), fps)
 
 
 def end_at_rounding(axes: Axes) -> None:

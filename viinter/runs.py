@@ -45,6 +45,10 @@ class Run:
         found = ((self.evaluation or {}) if kind == "finetuned" else (self.metrics or {})).get(kind)
         return found[key] if found else None
 
+    def measured_every(self, kind: str) -> int:
+        """One of so many views of `kind` was measured at the end of training, all of them by `viinter.evaluate`."""
+        return (self.metrics or {}).get("measured_every", {}).get(kind, 1)
+
 
 def read(folders: list[str | Path]) -> list[Run]:
     """All runs in `folders`, each a run, a sweep, or a folder that holds some; a sweep's missing jobs among them.

@@ -48,6 +48,8 @@ from viinter.module import ViewInterpolator, checkpoint_file, read_checkpoint
 from viinter.scenes import Scene
 from viinter.step_times import StepTimes
 
+FPS = 30  # of interpolation.mp4
+
 ABOUT = """
 Trains one field and one code for each image of a scene, and draws the views between them.
 
@@ -139,7 +141,7 @@ def train(
         if not first:
             return {}
         module.eval()
-        metrics = {**errors.final, **facts(cfg, scene, module, trainer, clock)}
+        metrics = {**errors.final, "measured_every": errors.every, **facts(cfg, scene, module, trainer, clock)}
         metrics |= {"seconds": times.seconds(), "restarts": len(guard.restarts), "restarted": guard.restarts}
         write_json(run_dir / "metrics.json", metrics)
         (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
@@ -289,8 +291,10 @@ def show(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, errors: Error
     """`strip.png`, `interpolation.mp4`, `error_vs_time.png`."""
     size, chunk, codes = (scene.height, scene.width), cfg.evaluation.chunk_pixels, module.codes.weight.detach()
     pictures.write_strip(run_dir / "strip.png", module.field, codes, scene.endpoints, size, chunk)
-    film = path(codes, list(scene.endpoints), cfg.logging.frames - 1)
-    pictures.write_film(run_dir / "interpolation.mp4", module.field, film, size, chunk)
+    frames = errors.film_frames(cfg.logging.frames)  # a film with fewer of them takes as long to watch
+    film = path(codes, list(scene.endpoints), frames - 1)
+    fps = FPS * frames / cfg.logging.frames
+    pictures.write_film(run_dir / "interpolation.mp4", module.field, film, size, chunk, fps)
     pictures.plot_error(run_dir / "error_vs_time.png", errors.rows, f"{scene.name}, model={cfg.model.name}")
 
 
@@ -301,7 +305,11 @@ def summary(metrics: dict[str, Any], run_dir: Path) -> str:
         if (found := metrics[kind])["per_view"]:
             psnr = "no finite PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"
             ssim = "no SSIM" if found["ssim"] is None else f"SSIM {found['ssim']:.4f}"
-            lines.append(f"{text:12} {psnr}  {ssim}")
+            every = metrics["measured_every"][kind]
+            some = f"  ({len(found['per_view'])} views, one of {every})" if every > 1 else ""
+            lines.append(f"{text:12} {psnr}  {ssim}{some}")
+    if max(metrics["measured_every"].values()) > 1:
+        lines.append(f"views take long to draw here; to measure them all: python -m viinter.evaluate run={run_dir}")
     lines.append(f"{metrics['steps']} steps in {metrics['training_seconds']:.1f} training seconds"
                  f" ({metrics['wall_seconds']:.1f} wall)")  # fmt: skip
     shown = ("strip.png", "interpolation.mp4", "error_vs_time.png", "metrics.json")

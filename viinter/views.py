@@ -59,6 +59,7 @@ def measure(
     kinds: list[str] | None = None,
     chunk_pixels: int = 131_072,
     seen: Callable[[str, int, Tensor, Tensor], None] | None = None,
+    every: int = 1,
 ) -> dict[str, dict]:
     """Errors of the known views ("known") and of the scene's probes ("novel", ...), each as `metrics.summary`.
 
@@ -69,11 +70,14 @@ def measure(
         kinds: which of "known" and the kinds of `scene.probes`; None for all.
         chunk_pixels: pixels drawn at a time.
         seen: called with (kind, index, image, target) for every view drawn, for pictures or a progress bar.
+        every: measures one of so many views of each kind, evenly spaced, and at least one.
     """
     found = {}
     for kind in kinds or ["known", *scene.probes]:
         errors = {}
-        for index, (name, z, target) in enumerate(_targets(codes, scene, kind)):
+        targets = list(_targets(codes, scene, kind))
+        first = min(every, len(targets)) // 2
+        for index, (name, z, target) in enumerate(targets[first::every]):
             image = draw(field, z, scene.height, scene.width, chunk_pixels)
             target = target.to(image.device)
             if seen:
