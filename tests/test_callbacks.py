@@ -353,7 +353,7 @@ def test_what_a_field_does_after_the_last_step_is_within_the_budget(make_config,
     """Steps of 0.25 s, drawing a view 0.5 s, five views to draw at the end: 20 of 23.5 s are left for steps."""
     takes(monkeypatch, stopwatch, callbacks, "draw", 0.5)
     takes(monkeypatch, stopwatch, PaperField, "finish", 2.5)
-    monkeypatch.setattr(PaperField, "finishing", lambda field, n: 5)
+    monkeypatch.setattr(PaperField, "settle", lambda field, seconds, n, batch, drawing: 5 * drawing())
     found = train(make_config(**{"optim.training_seconds": 23.5}), tmp_path)
     assert (found["training_seconds"], found["steps"]) == (23.5, (23.5 - 2.5 - 2 * 0.5) / 0.25)
 
@@ -361,7 +361,7 @@ def test_what_a_field_does_after_the_last_step_is_within_the_budget(make_config,
 def test_finishing_takes_at_most_half_of_a_budget_from_the_steps(make_config, tmp_path, stopwatch, monkeypatch):
     takes(monkeypatch, stopwatch, callbacks, "draw", 0.0)
     monkeypatch.setattr(callbacks, "seconds_to_draw", lambda *_: 100.0)
-    monkeypatch.setattr(PaperField, "finishing", lambda field, n: n)
+    monkeypatch.setattr(PaperField, "settle", lambda field, seconds, n, batch, drawing: n * drawing())
     assert train(make_config(**{"optim.training_seconds": 2.0}), tmp_path)["steps"] == 1.0 / 0.25
 
 

@@ -19,6 +19,17 @@ def make(height: int = 64, width: int = 64, views: int = 2, **changes) -> FastFi
     return FastField(M, views, height, width, **settings)
 
 
+def one_set(field: FastField, k: int) -> FastField:
+    """Set number k of `field` as a field of its own."""
+    sets, layers = field.shape
+    one = make(sets=1, layers=layers, entropy=field.entropy)
+    one.level, of_a_set = field.level, ("colours", "weights", "delta", "disparity", "shift", "bend")
+    for key, value in one.state_dict().items():
+        if key.startswith(of_a_set):
+            value.copy_(field.state_dict()[key].unflatten(0, (sets, -1))[k])
+    return one
+
+
 def scramble(field: FastField) -> FastField:
     with torch.no_grad():
         for value in field.parameters():
@@ -32,7 +43,7 @@ def test_motion_is_linear_in_the_code_so_that_a_mix_moves_half_way():
     phi = field.basis(pixel_grid(8, 8).T[None])
     ends = field.carry(phi.expand(2, -1, -1), field.place(z))
     middle = field.carry(phi, field.place(z.mean(0, keepdim=True)))
-    assert torch.allclose(middle[0], ends.mean(0), atol=1e-6)
+    assert torch.allclose(middle[:, 0], ends.mean(1), atol=1e-6)
 
 
 def test_norm_and_radius_of_the_codes_do_not_matter():
@@ -109,7 +120,7 @@ def test_the_penalty_is_greatest_undecided_and_nothing_once_each_pixel_has_one_l
     field(xy, z)
     assert field.penalty().item() == pytest.approx(1 - 1 / 4, abs=1e-6)
     with torch.no_grad():
-        field.weights[-1][2:4] = 10.0  # one of each set
+        field.weights[-1][[1, 6]] = 10.0  # one of each set
     field(xy, z)
     assert field.penalty().item() == pytest.approx(0, abs=1e-6)
 
@@ -118,13 +129,32 @@ def test_error_and_penalty_together_are_the_mean_error_of_the_sets():
     field, xy, z = scramble(make(entropy=0.0)), torch.rand(1, 50, 2) * 2 - 1, torch.randn(1, M)
     target = torch.rand(1, 50, 3)
     loss = (field(xy, z) - target).square().mean() + field.penalty()
-    alone = []
-    for k in range(2):
-        one = make(sets=1)
-        one.load_state_dict({key: value[k::2] if len(value.shape) and len(value) == 6 else value
-                             for key, value in field.state_dict().items()})  # fmt: skip
-        alone.append((one(xy, z) - target).square().mean())
+    alone = [(one_set(field, k)(xy, z) - target).square().mean() for k in range(2)]
     assert loss.item() == pytest.approx(torch.stack(alone).mean().item(), rel=1e-5)
+
+
+def test_without_a_remainder_nothing_is_kept_back_from_the_budget():
+    assert make(remainder=False).settle(1000.0, 2, 0.25, lambda: 0.1) == 0
+
+
+@pytest.mark.parametrize(("seconds", "left"), [(2, 1), (16, 1), (18, 2), (33, 2), (35, 4), (3600, 4)])
+def test_a_budget_that_is_too_short_for_all_sets_has_fewer(seconds, left):
+    """A step has a quarter of a view's pixels, which is drawn in a tenth of a second with all the sets: of such steps
+    there are to be 300, at four and a half times that."""
+    field = scramble(make(sets=4, layers=2))
+    xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
+    kept_back = field.settle(seconds, 2, 0.25, lambda: 0.1 * field.active / 4)
+    assert kept_back == pytest.approx(2 * 0.1 * left / 4)
+    assert field.active == left
+    assert torch.allclose(field(xy, z), torch.stack([one_set(field, k)(xy, z) for k in range(left)]).mean(0), atol=1e-6)
+    (field(xy, z).square().mean() + field.penalty()).backward()
+    codes, views = torch.randn(2, M), torch.rand(2, 64, 64, 3)
+    field.finish(views, codes)
+    other = make(sets=4, layers=2)
+    other.load_state_dict(field.state_dict())
+    assert other.active == left
+    assert torch.equal(draw(other.eval(), codes[0], 64, 64), draw(field.eval(), codes[0], 64, 64))
+    assert torch.allclose(draw(other, codes[1], 64, 64), views[1], atol=2e-3)
 
 
 def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump():
@@ -134,7 +164,6 @@ def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump
     field.calibrate(codes)
     field.finish(views, codes)
     field.eval()
-    assert field.finishing(12) == 12
     for k in range(12):
         assert torch.allclose(draw(field, codes[k], 40, 48), views[k], atol=2e-3)  # kept in half precision
     frames = [draw(field, lerp(codes[0], codes[1], t / 200), 40, 48) for t in range(201)]
@@ -201,7 +230,7 @@ def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross
     rows = pixel_grid(size, size).view(size, size, 2)
     random = torch.Generator().manual_seed(0)
     for step in range(400):
-        field.at(step / 400)
+        field.at(step / 400, step)
         for group, lr, rate in zip(optimizer.param_groups, first, field.rates(), strict=True):
             group["lr"] = lr * rate * (0.05 + 0.95 * (1 + math.cos(math.pi * step / 400)) / 2)
         seen = torch.randint(5, (size,), generator=random)

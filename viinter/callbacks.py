@@ -118,10 +118,12 @@ class Budget(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         self.clock.start()
         store = trainer.datamodule.store
-        self.enough = module.field.enough(store.n * store.height * store.width / self.cfg.batch_pixels)
-        views = module.field.finishing(store.n)
-        if views and self.cfg.training_seconds is not None and not self.kept_back:
-            self.kept_back = views * seconds_to_draw(module, store.height, store.width)
+        batch = self.cfg.batch_pixels / (store.height * store.width)
+        self.enough = module.field.enough(store.n / batch)
+        if (seconds := self.cfg.training_seconds) is not None and not trainer.global_step:
+            self.kept_back = module.field.settle(
+                seconds, store.n, batch, lambda: agreed(trainer, seconds_to_draw(module, store.height, store.width))
+            )
         trainer.should_stop = agreed(trainer, self.progress(trainer)) >= 1
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:

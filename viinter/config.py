@@ -145,7 +145,7 @@ class FastModel(ModelConfig):
     """Layers of texture carried by a learned motion (`fields/fast.py`)."""
 
     layers: int = setting(4, "surfaces that the scene is made of, in each set")
-    sets: int = setting(4, "sets of layers that see the scene each for itself; their mean is drawn")
+    sets: int = setting(4, "sets of layers, each right by itself, fewer in short budgets; their mean is drawn")
     motion: int = setting(6, "motion polynomials: 1 shifts, 3 adds turns and zooms, 6 adds perspective")
     margin: float = setting(1.1, "size of a texture in views, for what moves in from outside")
     sharpness: float = setting(5.0, "scale of the layers' weights in their softmax")

@@ -1,7 +1,7 @@
 """The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
 
 Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `K` motion polynomials,
-`S` sets of layers, `L` layers in all of them. A layer has colours [3, h, w] at about the resolution of a view, weights
+`S` active sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view, weights
 and disparities. Under the code z the pixel xy reads layer l at
 
     u_l = xy + a(xy, z) + d_l(u) b(xy, z),      a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
@@ -20,8 +20,9 @@ surface ends is a line, and pixels that go over to another surface in each view 
 A set's colour is the mean of its layers' colours, weighted by a softmax of their weights: not an alpha compositing,
 which trained more slowly and worse. What is drawn is the mean of the sets, and each is trained to be right by itself:
 where views leave something open, sets settle it differently, and their mean is nearer to the truth than either (as in
-the ensembles of Hansen and Salamon 1990). They share codes and motion. Layered textures read through a homography are
-the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
+the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. A budget
+that is too short for all of them has fewer. Layered textures read through a homography are the multi-plane images of
+Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
 
 What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
 view's remainder, read where the motion takes it, and shared among the known views nearest in motion.
@@ -42,6 +43,8 @@ from viinter.fields.field import Field
 COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
 MOST = 100, 300  # steps at each of the coarse levels, and at half size
 ENOUGH = 1500, 60  # steps, and passes over the known pixels: after both more time only learns known views by heart
+FEWEST = 300  # steps for which a budget in seconds should be enough, or sets are left out
+STEP = 4.5  # drawings of its pixels that a training step takes as long as
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
 
@@ -63,22 +66,26 @@ class FastField(Field):
         self.margin, self.sharpness, self.motion = margin, sharpness, motion
         self.entropy, self.smooth = entropy, smooth
         self.pitch = 2 / width
-        self.sets, layers = sets, layers * sets  # layer l belongs to set l % sets
+        self.shape, self.active = (sets, layers), sets
+        layers *= sets  # those of a set one after the other
         count = max(0, math.ceil(math.log2(min(height, width) / COARSEST))) + 1
         sizes = [(round(height * margin / 2**k), round(width * margin / 2**k)) for k in reversed(range(count))]
         self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
         halves = [(max(4, h // 2), max(4, w // 2)) for h, w in sizes]
         self.weights = nn.ParameterList(torch.zeros(layers, 1, *half) for half in halves[: max(1, count - 1)])
         self.delta = nn.Parameter(torch.zeros(layers, 1, *halves[max(0, count - 2)]))
-        self.disparity = nn.Parameter(torch.linspace(-1, 1, layers) if layers > 1 else torch.zeros(1))
-        self.shift = nn.Parameter(0.02 * torch.randn(4, code_dim) / math.sqrt(code_dim))
-        self.bend = nn.Parameter(torch.zeros(4 * (motion - 1), code_dim))
+        spread = torch.linspace(-1, 1, layers) if layers > 1 else torch.zeros(1)
+        self.disparity = nn.Parameter(spread.view(-1, sets).T.flatten())
+        self.shift = nn.Parameter(0.02 * torch.randn(sets, 4, code_dim) / math.sqrt(code_dim))
+        self.bend = nn.Parameter(torch.zeros(sets, 4 * (motion - 1), code_dim))
         self.register_buffer("gain", torch.ones(()))
         # half precision: a remainder is small, and a scene's memory should stay near that of its images
         shape = (views, 3, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
-        self.register_buffer("places", torch.zeros(shape[0], 4 * motion))
+        self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion))
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("decided", torch.zeros((), dtype=torch.long))  # how many sets are left, if so
+        self.register_load_state_dict_post_hook(lambda field, _: field._leave(int(field.decided) or sets))
         self.level, self.decision = count - 1, 1.0
 
     def calibrate(self, codes: Tensor) -> None:
@@ -119,13 +126,19 @@ class FastField(Field):
         self.level = level
         self.decision = min(max((progress - 0.3) / 0.3, 0.0), 1.0)
 
+    def _leave(self, sets: int) -> None:
+        if sets != self.active:
+            self.kept.clear()
+        self.active = sets
+
     def textures(self) -> Tensor:
-        """Colours and weights [L, 4, h, w] at the level in training.
+        """Colours and weights [S L, 4, h, w] of the active sets at the level in training.
 
         What stays the same from call to call is kept: while one level is trained the sum of those before it, and in
         evaluation, where no gradient is asked for, all of it.
         """
-        colours, weights = (list(group)[: self.level + 1] for group in (self.colours, self.weights))
+        count = self.active * self.shape[1]
+        colours, weights = ([t[:count] for t in list(g)[: self.level + 1]] for g in (self.colours, self.weights))
         if not self.training and not torch.is_grad_enabled():
             return self._kept("drawn", [*colours, *weights], lambda: self._together(pyramid(colours), pyramid(weights)))
         return self._together(self._trained("colours", colours), self._trained("weights", weights))
@@ -155,9 +168,10 @@ class FastField(Field):
         return super().train(mode)
 
     def place(self, z: Tensor) -> Tensor:
-        """The motion's coefficients [V, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
-        whole, difference = self.shift.chunk(2)
-        return F.linear(z * self.gain, torch.cat([whole, whole + difference, self.bend]))
+        """The motion's coefficients [V, S, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
+        whole, difference = self.shift[: self.active].chunk(2, 1)
+        matrix = torch.cat([whole, whole + difference, self.bend[: self.active]], 1)
+        return F.linear(z * self.gain, matrix.flatten(0, 1)).unflatten(1, matrix.shape[:2])
 
     def basis(self, xy: Tensor) -> Tensor:
         """The polynomials phi [V, K, P] at the pixels `xy` [V, 2, P]: planes, with which products are ten times as
@@ -166,8 +180,9 @@ class FastField(Field):
         return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y][: self.motion], 1)
 
     def carry(self, phi: Tensor, place: Tensor) -> Tensor:
-        """The motions a and b [V, 4, P], in units of a texture, from `basis` and `place`."""
-        return (place.view(-1, self.motion, 4) / self.margin).transpose(1, 2) @ phi
+        """The motions a and b [S, V, 4, P], in units of a texture, from `basis` and `place`."""
+        motion = (place.unflatten(2, (self.motion, 4)) / self.margin).transpose(2, 3)
+        return (motion.flatten(1, 2) @ phi).unflatten(1, motion.shape[1:3]).transpose(0, 1)
 
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
         """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped.
@@ -182,24 +197,24 @@ class FastField(Field):
         """As `forward`, from `xy` [V, 2, P]."""
         place = self.place(z)
         phi = self.basis(xy)
-        a, b = self.carry(phi, place).split(2, 1)
-        u = torch.addcmul(xy / self.margin + a, self.disparity[:, None, None, None], b)
-        disparity = self.disparity[:, None, None]
+        a, b = self.carry(phi, place)[:, None].split(2, 3)  # [S, 1, V, 2, P]
+        disparity = self.disparity.view(*self.shape, 1, 1)[: self.active]
+        u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
         if self.level >= min(2, len(self.colours) - 1):
-            delta = sample(self.delta, u)[:, 0]
-            u, disparity = torch.addcmul(u, delta[:, :, None], b), disparity + delta
-        read = sample(self.textures(), u).unflatten(0, (-1, self.sets))
-        weight = torch.softmax(self.sharpness * read[:, :, 3], 0)
-        each = (weight[:, :, None] * read[:, :, :3]).sum(0)  # [S, 3, V, P]
+            delta = read(self.delta[: self.active * self.shape[1]], u)[:, :, 0]
+            u, disparity = torch.addcmul(u, delta[:, :, :, None], b), disparity + delta
+        found = read(self.textures(), u)
+        weight = torch.softmax(self.sharpness * found[:, :, 3], 1)
+        each = (weight[:, :, None] * found[:, :, :3]).sum(1)  # [S, 3, V, P]
         mean = each.mean(0)
-        seen = (weight * disparity.unflatten(0, (-1, self.sets))).sum(0)  # the sets' disparities [S, V, P]
+        seen = (weight * disparity).sum(1)  # the sets' disparities [S, V, P]
         if self.training and torch.is_grad_enabled():
-            undecided = (1 - weight.square().sum(0)).mean()
+            undecided = (1 - weight.square().sum(1)).mean()
             self.held = (each - mean).square().mean() + self.decision * self.entropy * undecided
             self.held = self.held + self.smooth * self.roughness(xy, seen, each)
         rgb = mean.movedim(0, -1) + 0.5
         if not self.training and self.finished:  # asked only here: on a GPU the answer must be waited for
-            rgb = rgb + self.left_over(xy, phi, place, seen.mean(0))
+            rgb = rgb + self.left_over(xy, phi, place, seen)
         return rgb
 
     def roughness(self, xy: Tensor, disparity: Tensor, colour: Tensor) -> Tensor:
@@ -224,8 +239,15 @@ class FastField(Field):
         steps, passes = ENOUGH
         return max(steps, passes * steps_per_pass)
 
-    def finishing(self, n: int) -> int:
-        return n if len(self.remainder) else 0
+    def settle(self, seconds: float, views: int, batch: float, drawing: Callable[[], float]) -> float:
+        """Halves the sets until the budget is enough for `FEWEST` steps: in too few of them many sets learn less than
+        one that has all the time to itself."""
+        took = drawing()
+        while self.active > 1 and seconds < FEWEST * STEP * batch * took:
+            self._leave((self.active + 1) // 2)
+            took = drawing()
+        self.decided.fill_(self.active)
+        return views * took if len(self.remainder) else 0.0
 
     @torch.no_grad()
     def finish(self, views: Tensor, codes: Tensor) -> None:
@@ -244,7 +266,7 @@ class FastField(Field):
                 drawn = self(xy[None], codes[k : k + 1])[0].view(len(rows), width, 3)
                 self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).to(self.remainder.dtype)
         self.train(was)
-        self.places.copy_(self.place(codes))
+        self.places[:, : self.active] = self.place(codes)
         self.finished.fill_(True)
 
     def shares(self, place: Tensor) -> tuple[Tensor, Tensor]:
@@ -255,7 +277,8 @@ class FastField(Field):
         distance of the first view that is left out, so that a view enters and leaves a path without a jump (Shepard's
         interpolation, as Franke and Nielson 1980 made it local).
         """
-        apart = torch.cdist(place, self.places, compute_mode="donot_use_mm_for_euclid_dist")  # that would be inexact
+        place, known = place.flatten(1), self.places[:, : self.active].flatten(1)
+        apart = torch.cdist(place, known, compute_mode="donot_use_mm_for_euclid_dist")  # that would be inexact
         apart = apart.clamp_min(1e-6)  # two views may be at one place
         apart, views = apart.topk(min(NEAREST + 1, apart.shape[1]), largest=False)
         if apart.shape[1] > NEAREST:
@@ -267,19 +290,22 @@ class FastField(Field):
         return near / near.sum(-1, keepdim=True), views
 
     def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, disparity: Tensor) -> Tensor:
-        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place` with mean `disparity` [V, P]."""
+        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place`, where the sets with their
+        `disparity` [S, V, P] see them on average."""
         shares, views = self.shares(place)
+        apart = (place[:, None] - self.places[views][:, :, : self.active]).unflatten(3, (self.motion, 4)) / self.active
+        a, b = apart.split(2, 4)  # [V, N, S, K, 2]
+        weights = torch.cat([a.sum(2), b.flatten(2, 3)], 2).transpose(2, 3)
+        scaled = (disparity.movedim(0, 1)[:, :, None] * phi[:, None]).flatten(1, 2)
         _, _, height, width = self.remainder.shape
         size = xy.new_tensor([[width], [height]])
         scale = size / (size - 1).clamp_min(1)  # pixel centres at both ends, as grid_sample counts
-        here = (xy + 1) * scale - 1
-        by = self.margin * torch.cat([scale, scale])
+        motion = (scale * weights).flatten(1, 2) @ torch.cat([phi, scaled], 1)
+        there = ((xy + 1) * scale - 1)[:, None] + motion.unflatten(1, (-1, 2))  # [V, N, 2, P]
         total = xy.new_zeros(len(xy), 3, xy.shape[-1])
-        for share, view in zip(shares.unbind(-1), views.unbind(-1), strict=True):
-            a, b = (by * self.carry(phi, place - self.places[view])).split(2, 1)  # from there to here
-            there = torch.addcmul(here + a, disparity[:, None], b)
-            read = sample(self.remainder[view].to(there.dtype), there[:, None])[:, :, 0]
-            total.addcmul_(share[:, None, None], read)
+        for share, view, at in zip(shares.unbind(1), views.unbind(1), there.unbind(1), strict=True):
+            own = sample(self.remainder[view].to(at.dtype), at[:, None])[:, :, 0]
+            total.addcmul_(share[:, None, None], own)
         return total.movedim(1, -1)
 
 
@@ -294,6 +320,11 @@ def pyramid(levels: list[Tensor]) -> Tensor:
 def stretch(maps: Tensor, like: Tensor) -> Tensor:
     """Maps [N, C, h, w] brought to the size of `like` [..., h', w']; corner pixels stay at the corners."""
     return F.interpolate(maps, size=like.shape[-2:], mode="bilinear", align_corners=True)
+
+
+def read(maps: Tensor, u: Tensor) -> Tensor:
+    """Maps [S L, C, h, w] read at `u` [S, L, V, 2, P], [S, L, C, V, P]."""
+    return sample(maps, u.flatten(0, 1)).unflatten(0, u.shape[:2])
 
 
 def sample(maps: Tensor, u: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor, nn
@@ -35,9 +36,13 @@ class Field(nn.Module):
         """Steps that are of use, where a pass over all known pixels takes `steps_per_pass`: seconds beyond are left."""
         return math.inf
 
-    def finishing(self, n: int) -> int:
-        """As many views as `finish` will draw, of `n` known ones: the budget keeps the seconds for it back."""
-        return 0
+    def settle(self, seconds: float, views: int, batch: float, drawing: Callable[[], float]) -> float:
+        """Called once, before the first step of a budget in `seconds`; returns the seconds that `finish` will take.
+
+        There are `views` known views, a training step has `batch` times the pixels of one, and `drawing()` takes the
+        time, in seconds, of drawing one as the field is now.
+        """
+        return 0.0
 
     def finish(self, views: Tensor, codes: Tensor) -> None:
         """Called once, after the last step, with the known views [n, H, W, 3] and their codes [n, M]."""
