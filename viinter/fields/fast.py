@@ -137,11 +137,14 @@ class FastField(Field):
         What stays the same from call to call is kept: while one level is trained the sum of those before it, and in
         evaluation, where no gradient is asked for, all of it.
         """
-        count = self.active * self.shape[1]
-        colours, weights = ([t[:count] for t in list(g)[: self.level + 1]] for g in (self.colours, self.weights))
+        colours, weights = ([self._in_use(t) for t in list(g)[: self.level + 1]] for g in (self.colours, self.weights))
         if not self.training and not torch.is_grad_enabled():
             return self._kept("drawn", [*colours, *weights], lambda: self._together(pyramid(colours), pyramid(weights)))
         return self._together(self._trained("colours", colours), self._trained("weights", weights))
+
+    def _in_use(self, maps: Tensor) -> Tensor:
+        """Those of the active sets; all as they are, since the gradient of a part is filled up with zeros."""
+        return maps if self.active == self.shape[0] else maps[: self.active * self.shape[1]]
 
     @staticmethod
     def _together(colours: Tensor, weights: Tensor) -> Tensor:
@@ -201,11 +204,12 @@ class FastField(Field):
         disparity = self.disparity.view(*self.shape, 1, 1)[: self.active]
         u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
         if self.level >= min(2, len(self.colours) - 1):
-            delta = read(self.delta[: self.active * self.shape[1]], u)[:, :, 0]
+            delta = read(self._in_use(self.delta), u).squeeze(2)
             u, disparity = torch.addcmul(u, delta[:, :, :, None], b), disparity + delta
-        found = read(self.textures(), u)
-        weight = torch.softmax(self.sharpness * found[:, :, 3], 1)
-        each = (weight[:, :, None] * found[:, :, :3]).sum(1)  # [S, 3, V, P]
+        colour, weight = read(self.textures(), u).split([3, 1], 2)
+        weight = torch.softmax(self.sharpness * weight, 1)
+        each = (weight * colour).sum(1)  # [S, 3, V, P]
+        weight = weight.squeeze(2)
         mean = each.mean(0)
         seen = (weight * disparity).sum(1)  # the sets' disparities [S, V, P]
         if self.training and torch.is_grad_enabled():
