@@ -484,9 +484,9 @@ def test_with_no_share_there_is_one_evaluation_at_the_end(make_config, tmp_path)
 def test_the_last_measurement_of_views_that_take_long_to_draw_takes_evenly_spaced_ones(
     make_config, tmp_path, monkeypatch, capsys
 ):
-    """Four seconds a view: the 40 s are enough for a third of 9 known views and 12 probes, 20 s for all the 4 cells
-    and for five frames of the film."""
-    monkeypatch.setattr(callbacks, "seconds_to_draw", lambda *_: 4.0)
+    """Three and a half seconds a view: 30 s are enough for a third of 9 known views and 12 probes, 15 s for all of the
+    4 cells, but for no more of the film than there must be."""
+    monkeypatch.setattr(callbacks, "seconds_to_draw", lambda *_: 3.5)
     films = []
     monkeypatch.setattr(pictures, "write_film", lambda file, field, codes, *_: films.append((len(codes), _[-1])))
     shown = {"logging.pictures": True, "logging.progress": True, "logging.frames": 60}
@@ -497,7 +497,11 @@ def test_the_last_measurement_of_views_that_take_long_to_draw_takes_evenly_space
     assert found["measured_every"] == {"known": 3, "novel": 3, "novel_cells": 1, "novel_quarters": 1}
     names = list(scenes.load(cfg.scene).names)
     assert list(found["known"]["per_view"]) == [names[1], names[4], names[7]]
-    assert films == [(5, 30 * 5 / 60)]
+    assert films == [(2, 30 * 2 / 60)]
+    clock = SimpleNamespace(seconds=0.0)
+    errors = ErrorClock(cfg.evaluation, scenes.load(cfg.scene), clock, tmp_path)
+    errors.one = 1.0
+    assert [errors.film_frames(*asked) for asked in ((60, 5), (8, 5), (60, 14))] == [10, 8, 2]
     assert len(rows(tmp_path)) == 1
     said = capsys.readouterr().out
     assert "(3 views, one of 3)" in said

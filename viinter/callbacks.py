@@ -33,7 +33,7 @@ from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
 from viinter.views import draw, measure, pixel_grid
 
-LAST_SECONDS = 40.0  # that the last measurement may take however short a run was
+LAST_SECONDS = 30.0  # that the last measurement may take however short a run was
 
 CSV_COLUMNS = [
     "step", "training_seconds", "wall_seconds", "known_mse", "known_psnr", "known_ssim", "novel_mse", "novel_psnr",
@@ -288,9 +288,9 @@ class ErrorClock(L.Callback):
         self.final |= self._measure(trainer, module, others, beyond)
         self.every = dict.fromkeys(standard, every) | dict.fromkeys(others, beyond)
 
-    def film_frames(self, asked: int) -> int:
-        """So many of the `asked` frames of a film that drawing them keeps to what a last measurement may take."""
-        return max(2, min(asked, int(self._extra_seconds() / max(self.one, 1e-9))))
+    def film_frames(self, asked: int, others: int) -> int:
+        """So many of the `asked` frames of a film that they, and `others` frames, keep to `_extra_seconds`."""
+        return max(2, min(asked, int(self._extra_seconds() / max(self.one, 1e-9)) - others))
 
     def _extra_seconds(self) -> float:
         return max(self.cfg.max_share / 5 * self.clock.seconds, LAST_SECONDS / 2)

@@ -186,7 +186,7 @@ class FeaturesConfig:
 class EvaluationConfig:
     first_seconds: float = setting(5.0, "training seconds before the first evaluation")
     factor: float = setting(1.5, "each next evaluation comes after this times the training seconds of the last")
-    max_share: float = setting(0.1, "most of the training seconds that evaluations may take, but 40 s for the last one")
+    max_share: float = setting(0.1, "most of the training seconds that evaluations may take, but 30 s for the last one")
     chunk_pixels: int = setting(131_072, "pixels drawn at a time; lower it if memory runs out")
 
 

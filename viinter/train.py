@@ -291,7 +291,7 @@ def show(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, errors: Error
     """`strip.png`, `interpolation.mp4`, `error_vs_time.png`."""
     size, chunk, codes = (scene.height, scene.width), cfg.evaluation.chunk_pixels, module.codes.weight.detach()
     pictures.write_strip(run_dir / "strip.png", module.field, codes, scene.endpoints, size, chunk)
-    frames = errors.film_frames(cfg.logging.frames)  # a film with fewer of them takes as long to watch
+    frames = errors.film_frames(cfg.logging.frames, pictures.STRIP)  # a film with fewer of them takes as long to watch
     film = path(codes, list(scene.endpoints), frames - 1)
     fps = FPS * frames / cfg.logging.frames
     pictures.write_film(run_dir / "interpolation.mp4", module.field, film, size, chunk, fps)
