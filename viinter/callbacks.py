@@ -31,7 +31,7 @@ from viinter.features import FeatureTower, interpolation_loss
 from viinter.files import whole
 from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
-from viinter.views import draw, measure, pixel_grid
+from viinter.views import draw, draw_strip, measure, pixel_grid
 
 LAST_SECONDS = 30.0  # that the last measurement may take however short a run was
 
@@ -288,9 +288,9 @@ class ErrorClock(L.Callback):
         self.final |= self._measure(trainer, module, others, beyond)
         self.every = dict.fromkeys(standard, every) | dict.fromkeys(others, beyond)
 
-    def film_frames(self, asked: int, others: int) -> int:
-        """So many of the `asked` frames of a film that they, and `others` frames, keep to `_extra_seconds`."""
-        return max(2, min(asked, int(self._extra_seconds() / max(self.one, 1e-9)) - others))
+    def film_frames(self, asked: int) -> int:
+        """So many of the `asked` frames of a film that drawing them keeps to what a last measurement may take."""
+        return max(2, min(asked, int(self._extra_seconds() / max(self.one, 1e-9))))
 
     def _extra_seconds(self) -> float:
         return max(self.cfg.max_share / 5 * self.clock.seconds, LAST_SECONDS / 2)
@@ -366,14 +366,15 @@ class ErrorClock(L.Callback):
 class ViewLogger(L.Callback):
     """Pictures in TensorBoard: a known view and a probe beside their targets, and a strip of an interpolation.
 
-    It takes the pictures that `ErrorClock` draws anyway; the scalars of single steps (loss, PSNR of the batch, L_inter,
-    rate, norms) go out every `every_seconds`, so that no step waits for them.
+    It takes the pictures that `ErrorClock` draws anyway, and keeps the last `strip`; the scalars of single steps
+    (loss, PSNR of the batch, L_inter, rate, norms) go out every `every_seconds`, so that no step waits for them.
     """
 
     def __init__(self, cfg: LoggingConfig, scene: Scene, clock: Clock, errors: ErrorClock, chunk_pixels: int) -> None:
         self.cfg, self.scene, self.clock, self.chunk_pixels = cfg, scene, clock, chunk_pixels
         self.next = 0.0
         self.kept: dict[str, Tensor] = {}
+        self.strip: Tensor | None = None
         self.measured = 0
         self.errors = errors
         self.interpolation: InterpolationLoss | None = None
@@ -425,16 +426,11 @@ class ViewLogger(L.Callback):
         board, step = trainer.logger.experiment, trainer.global_step
         for kind, pair in self.kept.items():
             board.add_image(f"views/{kind}_and_target", pair, step, dataformats="HWC")
-        i, j = self.scene.endpoints
         module.eval()
         with trainer.strategy.precision_plugin.forward_context():
-            z = module.codes.weight.detach()
-            frames = [
-                draw(module.field, lerp(z[i], z[j], t / 4), self.scene.height, self.scene.width, self.chunk_pixels)
-                for t in range(5)
-            ]
+            self.strip = draw_strip(module.field, module.codes.weight.detach(), self.scene, self.chunk_pixels)
         module.train()
-        board.add_image("views/interpolation", torch.cat(frames, 1).clamp(0, 1), step, dataformats="HWC")
+        board.add_image("views/interpolation", self.strip, step, dataformats="HWC")
         board.flush()
         self.errors.spent += time.perf_counter() - begin
 

@@ -12,8 +12,7 @@ import matplotlib
 import torch
 from torch import Tensor, nn
 
-from viinter import image, video
-from viinter.codes import path
+from viinter import video
 from viinter.metrics import psnr
 from viinter.views import draw
 
@@ -22,15 +21,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
-STRIP = 5
 ROUNDING = (1 / 255) ** 2 / 12  # mean squared error of rounding to 8 bits
-
-
-def write_strip(file: Path, field: nn.Module, codes: Tensor, ends: tuple[int, int], size: tuple[int, int],
-                chunk_pixels: int) -> None:  # fmt: skip
-    """Five frames side by side at t = 0, 1/4, 1/2, 3/4, 1 between two known views (as the paper's Figure 5)."""
-    frames = [draw(field, z, *size, chunk_pixels) for z in path(codes, list(ends), STRIP - 1)]
-    image.write(file, torch.cat(frames, 1).clamp(0, 1).cpu())
 
 
 def write_film(

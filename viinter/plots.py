@@ -13,8 +13,9 @@ from torch import Tensor
 
 from viinter import image
 from viinter.evidence import BUDGET, curve, methods
-from viinter.pictures import STRIP, end_at_rounding
+from viinter.pictures import end_at_rounding
 from viinter.runs import Run
+from viinter.views import STRIP
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

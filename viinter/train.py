@@ -27,7 +27,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from viinter import command, config, features, pictures, scenes
+from viinter import command, config, features, image, pictures, scenes
 from viinter.callbacks import (
     Budget,
     Clock,
@@ -114,7 +114,8 @@ def train(
     callbacks.append(RenormalizeCodes())
     first = rank_zero_only.rank == 0  # of the processes that train together it alone looks and writes
     if first:
-        callbacks += [errors, ViewLogger(cfg.logging, scene, clock, errors, cfg.evaluation.chunk_pixels)]
+        views = ViewLogger(cfg.logging, scene, clock, errors, cfg.evaluation.chunk_pixels)
+        callbacks += [errors, views]
         if cfg.logging.progress:
             callbacks.append(ProgressBar(budget, clock, errors))
     checkpoint = SaveCheckpoint(cfg.checkpoint.every_seconds, clock, run_dir)
@@ -146,6 +147,7 @@ def train(
         write_json(run_dir / "metrics.json", metrics)
         (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
         if cfg.logging.pictures:
+            image.write(run_dir / "strip.png", views.strip.cpu())
             show(cfg, scene, module, errors, run_dir)
     except SystemExit as ended:
         if not isinstance(ended.__context__, KeyboardInterrupt):  # submitit's, after it has put the job into the queue
@@ -288,10 +290,9 @@ def hardware(device: torch.device) -> str:
 
 
 def show(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, errors: ErrorClock, run_dir: Path) -> None:
-    """`strip.png`, `interpolation.mp4`, `error_vs_time.png`."""
+    """`interpolation.mp4`, `error_vs_time.png`."""
     size, chunk, codes = (scene.height, scene.width), cfg.evaluation.chunk_pixels, module.codes.weight.detach()
-    pictures.write_strip(run_dir / "strip.png", module.field, codes, scene.endpoints, size, chunk)
-    frames = errors.film_frames(cfg.logging.frames, pictures.STRIP)  # a film with fewer of them takes as long to watch
+    frames = errors.film_frames(cfg.logging.frames)  # a film with fewer of them takes as long to watch
     film = path(codes, list(scene.endpoints), frames - 1)
     fps = FPS * frames / cfg.logging.frames
     pictures.write_film(run_dir / "interpolation.mp4", module.field, film, size, chunk, fps)
