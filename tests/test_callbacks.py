@@ -509,9 +509,10 @@ def test_the_last_measurement_of_views_that_take_long_to_draw_takes_evenly_space
 
 
 def test_the_last_measurement_may_take_what_is_left_of_its_share(make_config, tmp_path, stopwatch, monkeypatch):
-    """Ten seconds of training and a share of 84 / 10: all 21 views in 84 s; none on the way, for half of it is less."""
+    """Ten seconds of training and a share of 104 / 10: all 21 views in 84 s and a strip in 20; none on the way, for
+    half of it is less."""
     monkeypatch.setattr(callbacks, "seconds_to_draw", lambda *_: 4.0)
-    share = {"evaluation.first_seconds": 0.25, "evaluation.max_share": 8.4}
+    share = {"evaluation.first_seconds": 0.25, "evaluation.max_share": 10.4}
     found = train(make_config(**{"optim.steps": 40, **share}), tmp_path)
     assert [int(row["step"]) for row in rows(tmp_path)] == [40]
     assert found["measured_every"]["novel"] == 1

@@ -31,7 +31,7 @@ from viinter.features import FeatureTower, interpolation_loss
 from viinter.files import whole
 from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
-from viinter.views import draw, draw_strip, measure, pixel_grid
+from viinter.views import STRIP, draw, draw_strip, measure, pixel_grid
 
 LAST_SECONDS = 30.0  # that the last measurement may take however short a run was
 
@@ -281,7 +281,7 @@ class ErrorClock(L.Callback):
             self.rows.pop()
         self._time_a_view(trainer, module)  # not as it was in training: the field has finished since
         standard, others = ["known", "novel"], [kind for kind in self.scene.probes if kind != "novel"]
-        left = self.cfg.max_share * self.clock.seconds - self.spent
+        left = self.cfg.max_share * self.clock.seconds - self.spent - STRIP * self.one  # a strip is drawn too
         every = self._every(standard, max(left, LAST_SECONDS))
         self.final = self.evaluate(trainer, module, standard, every)
         beyond = self._every(others, self._extra_seconds())
