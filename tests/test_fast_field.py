@@ -1,6 +1,7 @@
 """The fast field: motion, levels, remainders, and a small scene that moves."""
 
 import math
+import pickle
 
 import pytest
 import torch
@@ -150,7 +151,7 @@ def test_a_budget_that_is_too_short_for_all_sets_has_fewer(seconds, left):
     (field(xy, z).square().mean() + field.penalty()).backward()
     codes, views = torch.randn(2, M), torch.rand(2, 64, 64, 3)
     field.finish(views, codes)
-    other = make(sets=4, layers=2)
+    other = pickle.loads(pickle.dumps(make(sets=4, layers=2)))
     other.load_state_dict(field.state_dict())
     assert other.active == left
     assert torch.equal(draw(other.eval(), codes[0], 64, 64), draw(field.eval(), codes[0], 64, 64))

@@ -92,6 +92,15 @@ def agreed(trainer: L.Trainer, value: Any) -> Any:
     return trainer.strategy.broadcast(value) if trainer.world_size > 1 else value
 
 
+@contextmanager
+def looking(trainer: L.Trainer, module: ViewInterpolator) -> Iterator[None]:
+    """Evaluation mode, in the precision that the run trains in; then training mode again."""
+    module.eval()
+    with trainer.strategy.precision_plugin.forward_context():
+        yield
+    module.train()
+
+
 class Budget(L.Callback):
     """Ends the run after so many steps or training seconds, and lays the cosine schedule over whichever is given.
 
@@ -293,6 +302,7 @@ class ErrorClock(L.Callback):
         return max(2, min(asked, int(self._extra_seconds() / max(self.one, 1e-9))))
 
     def _extra_seconds(self) -> float:
+        """What the probes beyond the standard ones may take at the end, and the film once more."""
         return max(self.cfg.max_share / 5 * self.clock.seconds, LAST_SECONDS / 2)
 
     def _views(self, *kinds: str) -> int:
@@ -302,23 +312,18 @@ class ErrorClock(L.Callback):
         return max(1, math.ceil(self.one * self._views(*kinds) / seconds))
 
     def _time_a_view(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
-        with self.clock.paused(), trainer.strategy.precision_plugin.forward_context():
-            module.eval()
+        with self.clock.paused(), looking(trainer, module):
             self.one = seconds_to_draw(module, self.scene.height, self.scene.width, self.cfg.chunk_pixels)
-            module.train()
 
     def _measure(
         self, trainer: L.Trainer, module: ViewInterpolator, kinds: list[str], every: int
     ) -> dict[str, dict]:
         if not kinds:
             return {}
-        module.eval()
-        with trainer.strategy.precision_plugin.forward_context():
-            found = measure(
+        with looking(trainer, module):
+            return measure(
                 module.field, module.codes.weight.detach(), self.scene, kinds, self.cfg.chunk_pixels, self._seen, every
             )
-        module.train()
-        return found
 
     def evaluate(
         self, trainer: L.Trainer, module: ViewInterpolator, kinds: list[str], every: int = 1
@@ -426,10 +431,8 @@ class ViewLogger(L.Callback):
         board, step = trainer.logger.experiment, trainer.global_step
         for kind, pair in self.kept.items():
             board.add_image(f"views/{kind}_and_target", pair, step, dataformats="HWC")
-        module.eval()
-        with trainer.strategy.precision_plugin.forward_context():
+        with looking(trainer, module):
             self.strip = draw_strip(module.field, module.codes.weight.detach(), self.scene, self.chunk_pixels)
-        module.train()
         board.add_image("views/interpolation", self.strip, step, dataformats="HWC")
         board.flush()
         self.errors.spent += time.perf_counter() - begin

@@ -114,8 +114,8 @@ def train(
     callbacks.append(RenormalizeCodes())
     first = rank_zero_only.rank == 0  # of the processes that train together it alone looks and writes
     if first:
-        views = ViewLogger(cfg.logging, scene, clock, errors, cfg.evaluation.chunk_pixels)
-        callbacks += [errors, views]
+        view_logger = ViewLogger(cfg.logging, scene, clock, errors, cfg.evaluation.chunk_pixels)
+        callbacks += [errors, view_logger]
         if cfg.logging.progress:
             callbacks.append(ProgressBar(budget, clock, errors))
     checkpoint = SaveCheckpoint(cfg.checkpoint.every_seconds, clock, run_dir)
@@ -147,8 +147,7 @@ def train(
         write_json(run_dir / "metrics.json", metrics)
         (run_dir / "hparams.yaml").unlink(missing_ok=True)  # TensorBoardLogger's; .hydra/config.yaml has them all
         if cfg.logging.pictures:
-            image.write(run_dir / "strip.png", views.strip.cpu())
-            show(cfg, scene, module, errors, run_dir)
+            show(cfg, scene, module, errors, view_logger.strip, run_dir)
     except SystemExit as ended:
         if not isinstance(ended.__context__, KeyboardInterrupt):  # submitit's, after it has put the job into the queue
             raise
@@ -289,8 +288,11 @@ def hardware(device: torch.device) -> str:
     return f"{name}, {os.cpu_count()} logical processors"
 
 
-def show(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, errors: ErrorClock, run_dir: Path) -> None:
-    """`interpolation.mp4`, `error_vs_time.png`."""
+def show(
+    cfg: TrainConfig, scene: Scene, module: ViewInterpolator, errors: ErrorClock, strip: torch.Tensor, run_dir: Path
+) -> None:
+    """`strip.png`, `interpolation.mp4`, `error_vs_time.png`."""
+    image.write(run_dir / "strip.png", strip.cpu())
     size, chunk, codes = (scene.height, scene.width), cfg.evaluation.chunk_pixels, module.codes.weight.detach()
     frames = errors.film_frames(cfg.logging.frames)  # a film with fewer of them takes as long to watch
     film = path(codes, list(scene.endpoints), frames - 1)

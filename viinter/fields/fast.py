@@ -85,7 +85,7 @@ class FastField(Field):
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion))
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.register_buffer("decided", torch.zeros((), dtype=torch.long))  # how many sets are left, if so
-        self.register_load_state_dict_post_hook(lambda field, _: field._leave(int(field.decided) or sets))
+        self.register_load_state_dict_post_hook(FastField._loaded)
         self.level, self.decision = count - 1, 1.0
 
     def calibrate(self, codes: Tensor) -> None:
@@ -125,6 +125,10 @@ class FastField(Field):
             self.kept.clear()
         self.level = level
         self.decision = min(max((progress - 0.3) / 0.3, 0.0), 1.0)
+
+    @staticmethod
+    def _loaded(field: FastField, _: Any) -> None:
+        field._leave(int(field.decided) or field.shape[0])
 
     def _leave(self, sets: int) -> None:
         if sets != self.active:
