@@ -134,8 +134,29 @@ def test_error_and_penalty_together_are_the_mean_error_of_the_sets():
     assert loss.item() == pytest.approx(torch.stack(alone).mean().item(), rel=1e-5)
 
 
-def test_without_a_remainder_nothing_is_kept_back_from_the_budget():
-    assert make(remainder=False).settle(1000.0, 2, 0.25, lambda: 0.1) == 0
+def test_without_a_remainder_only_the_time_to_judge_the_sets_is_kept_back_from_the_budget():
+    assert make(remainder=False).settle(1000.0, 2, 0.25, lambda: 0.1) == pytest.approx(2 * 0.1 / 8)
+
+
+def test_each_set_counts_by_the_inverse_of_its_error_at_the_known_views():
+    field, codes, views = scramble(make(sets=3, remainder=False)), torch.randn(2, M), torch.rand(2, 64, 64, 3)
+    field.finish(views, codes)
+    errors = [[(draw(one_set(field, k), z, 64, 64) - v)[::8].square().mean() for z, v in zip(codes, views, strict=True)]
+              for k in range(3)]  # fmt: skip
+    inverse = 1 / torch.tensor(errors).mean(1)
+    assert torch.allclose(field.trust, inverse / inverse.sum(), atol=1e-5)
+    alone = torch.stack([draw(one_set(field, k), codes[0], 64, 64) for k in range(3)])
+    assert torch.allclose(draw(field.eval(), codes[0], 64, 64), torch.tensordot(field.trust, alone, 1), atol=1e-5)
+
+
+@pytest.mark.parametrize("remainder", [False, True])
+def test_a_set_that_went_wrong_loses_its_voice(remainder):
+    field, codes = scramble(make(views=2, remainder=remainder)), torch.randn(2, M)
+    right = torch.stack([draw(one_set(field, 1).eval(), z, 64, 64) for z in codes])
+    field.finish(right, codes)
+    assert field.trust[1] > 0.999
+    middle = codes.mean(0)
+    assert torch.allclose(draw(field.eval(), middle, 64, 64), draw(one_set(field, 1), middle, 64, 64), atol=1e-3)
 
 
 @pytest.mark.parametrize(("seconds", "left"), [(2, 1), (16, 1), (18, 2), (33, 2), (35, 4), (3600, 4)])
@@ -145,7 +166,7 @@ def test_a_budget_that_is_too_short_for_all_sets_has_fewer(seconds, left):
     field = scramble(make(sets=4, layers=2))
     xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
     kept_back = field.settle(seconds, 2, 0.25, lambda: 0.1 * field.active / 4)
-    assert kept_back == pytest.approx(2 * 0.1 * left / 4)
+    assert kept_back == pytest.approx(2 * 0.1 * left / 4 * (1 + 1 / 8))
     assert field.active == left
     assert torch.allclose(field(xy, z), torch.stack([one_set(field, k)(xy, z) for k in range(left)]).mean(0), atol=1e-6)
     (field(xy, z).square().mean() + field.penalty()).backward()

@@ -20,8 +20,9 @@ surface ends is a line, and pixels that go over to another surface in each view 
 A set's colour is the mean of its layers' colours, weighted by a softmax of their weights: not an alpha compositing,
 which trained more slowly and worse. What is drawn is the mean of the sets, and each is trained to be right by itself:
 where views leave something open, sets settle it differently, and their mean is nearer to the truth than either (as in
-the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. A budget
-that is too short for all of them has fewer. Layered textures read through a homography are the multi-plane images of
+the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. At the end
+each counts by the inverse of its error at the known views: one that took repeating stripes for their neighbours loses
+its voice. A budget that is too short for all of them has fewer. Layered textures read through a homography are the multi-plane images of
 Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
 
 What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
@@ -47,6 +48,7 @@ FEWEST = 300  # steps for which a budget in seconds should be enough, or sets ar
 STEP = 4.5  # drawings of its pixels that a training step takes as long as
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
+JUDGED = 8  # one of so many rows of the known views says how much each set counts
 
 
 class FastField(Field):
@@ -83,6 +85,7 @@ class FastField(Field):
         shape = (views, 3, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion))
+        self.register_buffer("trust", torch.ones(sets))  # shares of the active sets in what is drawn, once finished
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.register_buffer("decided", torch.zeros((), dtype=torch.long))  # how many sets are left, if so
         self.register_load_state_dict_post_hook(FastField._loaded)
@@ -202,8 +205,21 @@ class FastField(Field):
 
     def _colours(self, xy: Tensor, z: Tensor) -> Tensor:
         """As `forward`, from `xy` [V, 2, P]."""
-        place = self.place(z)
-        phi = self.basis(xy)
+        place, phi = self.place(z), self.basis(xy)
+        each, weight, seen = self.each_set(xy, phi, place)
+        # asked only in evaluation: on a GPU the answer must be waited for
+        finished = not self.training and bool(self.finished)
+        mean = self.mean(each) if finished else each.mean(0)
+        if self.training and torch.is_grad_enabled():
+            undecided = (1 - weight.square().sum(1)).mean()
+            self.held = (each - mean).square().mean() + self.decision * self.entropy * undecided
+            self.held = self.held + self.smooth * self.roughness(xy, seen, each)
+        rgb = mean.movedim(0, -1) + 0.5
+        return rgb + self.left_over(xy, phi, place, seen) if finished and len(self.remainder) else rgb
+
+    def each_set(self, xy: Tensor, phi: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What each set shows at `xy` [V, 2, P] with `basis` and `place`: its colour less 0.5 [S, 3, V, P], its layers'
+        weights [S, L, V, P], and its disparity [S, V, P]."""
         a, b = self.carry(phi, place)[:, None].split(2, 3)  # [S, 1, V, 2, P]
         disparity = self.disparity.view(*self.shape, 1, 1)[: self.active]
         u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
@@ -212,18 +228,8 @@ class FastField(Field):
             u, disparity = torch.addcmul(u, delta[:, :, :, None], b), disparity + delta
         colour, weight = read(self.textures(), u).split([3, 1], 2)
         weight = torch.softmax(self.sharpness * weight, 1)
-        each = (weight * colour).sum(1)  # [S, 3, V, P]
-        weight = weight.squeeze(2)
-        mean = each.mean(0)
-        seen = (weight * disparity).sum(1)  # the sets' disparities [S, V, P]
-        if self.training and torch.is_grad_enabled():
-            undecided = (1 - weight.square().sum(1)).mean()
-            self.held = (each - mean).square().mean() + self.decision * self.entropy * undecided
-            self.held = self.held + self.smooth * self.roughness(xy, seen, each)
-        rgb = mean.movedim(0, -1) + 0.5
-        if not self.training and self.finished:  # asked only here: on a GPU the answer must be waited for
-            rgb = rgb + self.left_over(xy, phi, place, seen)
-        return rgb
+        each, weight = (weight * colour).sum(1), weight.squeeze(2)
+        return each, weight, (weight * disparity).sum(1)
 
     def roughness(self, xy: Tensor, disparity: Tensor, colour: Tensor) -> Tensor:
         """How much `disparity` [S, V, P] differs between pixels that lie side by side, less where `colour` [S, 3, V, P]
@@ -255,37 +261,53 @@ class FastField(Field):
             self._leave((self.active + 1) // 2)
             took = drawing()
         self.decided.fill_(self.active)
-        return views * took if len(self.remainder) else 0.0
+        return views * took * (1 / JUDGED + bool(len(self.remainder)))
 
     @torch.no_grad()
     def finish(self, views: Tensor, codes: Tensor) -> None:
-        """Keeps what the layers leave over of the known views [n, H, W, 3] with codes [n, M]."""
-        if not len(self.remainder):
-            return
+        """Settles how much each set counts, and keeps what the layers leave over of the known views [n, H, W, 3] with
+        codes [n, M].
+
+        The mean of guesses whose errors are independent is best with weights that are inverse to their squares.
+        """
         _, height, width, _ = views.shape
-        x = -1 + 2 * torch.arange(width, device=views.device) / width
-        y = -1 + 2 * torch.arange(height, device=views.device) / height
-        self.finished.fill_(False)
+        views, codes = views.movedim(-1, 1).to(self.shift.dtype), codes.to(self.shift.dtype)
         was = self.training
         self.eval()
-        for k, view in enumerate(views):
-            for rows in torch.arange(height, device=views.device).split(max(1, 65_536 // width)):
-                xy = torch.stack(torch.meshgrid(x, y[rows], indexing="xy"), -1).flatten(0, 1)
-                drawn = self(xy[None], codes[k : k + 1])[0].view(len(rows), width, 3)
-                self.remainder[k, :, rows] = (view[rows] - drawn).movedim(-1, 0).to(self.remainder.dtype)
-        self.train(was)
-        self.places[:, : self.active] = self.place(codes)
+        x, y = (-1 + 2 * torch.arange(size).to(views) / size for size in (width, height))
+
+        def shown(code: Tensor, rows: slice) -> Tensor:
+            """What each set shows of some rows of a view, [S, 3, h, W]."""
+            xy = torch.stack(torch.meshgrid(x, y[rows], indexing="xy")).flatten(1)[None]
+            each, _, _ = self.each_set(xy, self.basis(xy), self.place(code[None]))
+            return each[:, :, 0].unflatten(2, (-1, width)) + 0.5
+
+        some, many = slice(None, None, JUDGED), max(1, 65_536 // width)
+        errors = [(shown(z, some) - view[:, some]).square().mean((1, 2, 3)) for view, z in zip(views, codes, strict=True)]
+        inverse = 1 / torch.stack(errors).mean(0).clamp_min(1e-12)
+        self.trust[: self.active] = inverse / inverse.sum()
+        if len(self.remainder):
+            self.places[:, : self.active] = self.place(codes)
+            for own, view, z in zip(self.remainder, views, codes, strict=True):
+                for rows in (slice(k, k + many) for k in range(0, height, many)):
+                    own[:, rows] = view[:, rows] - self.mean(shown(z, rows))
         self.finished.fill_(True)
+        self.train(was)
+
+    def mean(self, each: Tensor) -> Tensor:
+        """The sets' mean of `each` [S, ...], each set by its trust."""
+        return torch.tensordot(self.trust[: self.active], each, 1)
 
     def shares(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """How much each of the `N` known views nearest to `place` [V, 4 K] gives of its remainder: [V, N], summing to
+        """How much each of the `N` known views nearest to `place` [V, S, 4 K] gives of its remainder: [V, N], summing to
         1, and which views these are, [V, N].
 
         A known view's share falls with its distance in motion, and is all of it at its own place; it is gone at the
         distance of the first view that is left out, so that a view enters and leaves a path without a jump (Shepard's
         interpolation, as Franke and Nielson 1980 made it local).
         """
-        place, known = place.flatten(1), self.places[:, : self.active].flatten(1)
+        trust = self.trust[: self.active, None]
+        place, known = (trust * place).flatten(1), (trust * self.places[:, : self.active]).flatten(1)
         apart = torch.cdist(place, known, compute_mode="donot_use_mm_for_euclid_dist")  # that would be inexact
         apart = apart.clamp_min(1e-6)  # two views may be at one place
         apart, views = apart.topk(min(NEAREST + 1, apart.shape[1]), largest=False)
@@ -299,10 +321,10 @@ class FastField(Field):
 
     def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, disparity: Tensor) -> Tensor:
         """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place`, where the sets with their
-        `disparity` [S, V, P] see them on average."""
+        `disparity` [S, V, P] see them on average, each by its trust."""
         shares, views = self.shares(place)
-        apart = (place[:, None] - self.places[views][:, :, : self.active]).unflatten(3, (self.motion, 4)) / self.active
-        a, b = apart.split(2, 4)  # [V, N, S, K, 2]
+        apart = self.trust[: self.active, None] * (place[:, None] - self.places[views][:, :, : self.active])
+        a, b = apart.unflatten(3, (self.motion, 4)).split(2, 4)  # [V, N, S, K, 2]
         weights = torch.cat([a.sum(2), b.flatten(2, 3)], 2).transpose(2, 3)
         scaled = (disparity.movedim(0, 1)[:, :, None] * phi[:, None]).flatten(1, 2)
         _, _, height, width = self.remainder.shape
