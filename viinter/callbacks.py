@@ -127,6 +127,7 @@ class Budget(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         self.clock.start()
         store = trainer.datamodule.store
+        module.field.see(store.views)
         batch = self.cfg.batch_pixels / (store.height * store.width)
         self.enough = module.field.enough(store.n / batch)
         if (seconds := self.cfg.training_seconds) is not None and not trainer.global_step:
@@ -148,8 +149,7 @@ class Budget(L.Callback):
 
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         store = trainer.datamodule.store
-        views = store.rgb.view(store.n, store.height, store.width, 3)
-        module.field.finish(views, module.codes.weight.detach())
+        module.field.finish(store.views, module.codes.weight.detach())
         self.clock.stop()
 
     def state_dict(self) -> dict[str, float]:

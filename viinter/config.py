@@ -151,6 +151,7 @@ class FastModel(ModelConfig):
     sharpness: float = setting(5.0, "scale of the layers' weights in their softmax")
     entropy: float = setting(1e-3, "weight of the penalty on pixels that mix layers")
     smooth: float = setting(2e-3, "weight of the penalty on disparities that differ between pixels of one colour")
+    consistency: float = setting(1.0, "weight of the penalty on pixels that a known view nearby does not have there")
     remainder: bool = setting(True, "keep what the layers leave over of each known view, and share it out")
 
 
@@ -339,7 +340,8 @@ def check(cfg: TrainConfig) -> None:
         want(value > 0 and math.isfinite(value), key, value, "a number above 0")
     if isinstance(cfg.model, FastModel):
         want(cfg.model.motion in (1, 3, 6), "model.motion", cfg.model.motion, "1, 3 or 6")
-        for key, value in (("entropy", cfg.model.entropy), ("smooth", cfg.model.smooth)):
+        for key in ("entropy", "smooth", "consistency"):
+            value = getattr(cfg.model, key)
             want(value >= 0, f"model.{key}", value, "0 or more")
         want(cfg.trainer.precision not in ("16-true", "bf16-true"), "trainer.precision", cfg.trainer.precision,
              "32-true, 64-true or a mixed one with model=fast: its motions are finer than 16 bits")  # fmt: skip

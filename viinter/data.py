@@ -44,7 +44,8 @@ class PixelStore:
         part: int = 0, parts: int = 1,
     ) -> None:  # fmt: skip
         self.n, self.height, self.width, _ = views.shape
-        self.rgb = views.reshape(-1, 3).to(device)
+        self.views = views.to(device)
+        self.rgb = self.views.reshape(-1, 3)
         self.pixels, self.pixels_from, self.seed = pixels, pixels_from, seed
         self.generator = torch.Generator(device)
         self.pitch = torch.tensor([2 / self.width, 2 / self.height], device=device)

@@ -56,7 +56,9 @@ class ViewInterpolator(L.LightningModule):
         return self.field(xy, z)
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
-        return F.mse_loss(self.field(batch.xy, self.codes.weight[batch.view]), batch.rgb) + self.field.penalty()
+        codes = self.codes.weight
+        error = F.mse_loss(self.field(batch.xy, codes[batch.view]), batch.rgb)
+        return error + self.field.penalty(batch.view, batch.rgb, codes)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam over field and codes (supplement); the rate is set before each step by `callbacks.Budget`."""

@@ -94,13 +94,14 @@ def costs(run: Run, decibel: float) -> dict[str, float | None]:
 def step_work(height: int, width: int, layers: int, pixels: int) -> dict[str, float]:
     """Operations and bytes of one step of `model=fast` at full size, and milliseconds by memory alone on an H100.
 
-    For each pixel and layer, 4 corners of 4 channels and 1 of disparity are read forward, and read and added to
-    backward; each reading takes about 12 operations a channel, the softmax and what moves about 100 a layer. What the
-    graph keeps for the backward pass is written and read once: about 20 numbers a pixel and layer. Adam reads value,
-    gradient and two moments and writes three of them, and the gradient is cleared, for each of the layers' numbers.
+    For each pixel and layer, 4 corners of 4 channels, and of disparity and drift, are read forward, and read and added
+    to backward; each reading takes about 12 operations a channel, the softmax and what moves about 100 a layer. What
+    the graph keeps for the backward pass is written and read once: about 20 numbers a pixel and layer. Adam reads
+    value, gradient and two moments and writes three of them, and the gradient is cleared, for each of the layers'
+    numbers. Looking up a quarter of the pixels in another view is not counted.
     """
     numbers = layers * 3 * (1.1 * height) * (1.1 * width) * 13 / 12  # colours, and weights and disparities of a quarter
     reads = pixels * layers
-    operations = 3 * reads * (5 * 12 + 100) + 12 * numbers
-    moved = 4 * (reads * (3 * 20 + 2 * 20) + 8 * numbers)
+    operations = 3 * reads * (6 * 12 + 100) + 12 * numbers
+    moved = 4 * (reads * (3 * 24 + 2 * 20) + 8 * numbers)
     return {"GFLOP": operations / 1e9, "MB": moved / 1e6, "ms at 3.35 TB/s": moved / 3.35e12 * 1e3}

@@ -4,26 +4,32 @@ Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n
 `S` active sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view, weights
 and disparities. Under the code z the pixel xy reads layer l at
 
-    u_l = xy + a(xy, z) + d_l(u) b(xy, z),      a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
+    u_l = xy + a(xy, z) + d_l(u) b(xy, z) + e_l(u) c(z),    a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
 
-phi = {1, x, y, x^2, xy, y^2}, and a_k, b_k linear in z. That is the image motion of a rigid scene under a small camera
-motion (Longuet-Higgins and Prazdny 1980): `a` the part that a rotation gives every depth alike, `b` the part that a
-translation gives in proportion to inverse depth. Nothing is told to it: a_k(z), b_k(z), the disparities and the
-textures are all learned from the pixels. But b_0 is written as a_0 and a difference, so that parallax begins along the
-motion of the whole, as it is under a pure translation: left to itself it may come out too strong in one direction,
-where horizontal and vertical edges then choose different disparities. Since the motion is linear in z, a mix of codes
-moves each surface half way where a cross-fade would show it twice.
+phi = {1, x, y, x^2, xy, y^2}, and a_k, b_k, c linear in z. With e = 0 that is the image motion of a rigid scene under a
+small camera motion (Longuet-Higgins and Prazdny 1980): `a` the part that a rotation gives every depth alike, `b` the
+part that a translation gives in proportion to inverse depth. The drift e_l is for what moves by itself: a face that
+turns between two pictures. Nothing is told to it: a_k(z), b_k(z), c(z), disparities, drifts and textures are all
+learned from the pixels. But b_0 is written as a_0 and a difference, so that parallax begins along the motion of the
+whole, as it is under a pure translation: left to itself it may come out too strong in one direction, where horizontal
+and vertical edges then choose different disparities. c begins across it, so that d and e together reach everywhere.
+Since the motion is linear in z, a mix of codes moves each surface half way where a cross-fade would show it twice.
 
-The disparity d_l(u) = d_l + delta_l(u) has a smooth map delta_l. The weights are coarser than the colours too: where a
-surface ends is a line, and pixels that go over to another surface in each view would learn known views by heart.
+The disparity d_l(u) = d_l + delta_l(u) has a smooth map delta_l, and e_l(u) is one. The weights are coarser than the
+colours too: where a surface ends is a line, and pixels that go over to another surface in each view would learn known
+views by heart.
 
 A set's colour is the mean of its layers' colours, weighted by a softmax of their weights: not an alpha compositing,
 which trained more slowly and worse. What is drawn is the mean of the sets, and each is trained to be right by itself:
 where views leave something open, sets settle it differently, and their mean is nearer to the truth than either (as in
 the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. At the end
 each counts by the inverse of its error at the known views: one that took repeating stripes for their neighbours loses
-its voice. A budget that is too short for all of them has fewer. Layered textures read through a homography are the multi-plane images of
-Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
+its voice. A budget that is too short for all of them has fewer. Layered textures read through a homography are the
+multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
+
+Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
+therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
+takes it in a view nearby (as in Zhou et al. 2017, who learn depth so).
 
 What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
 view's remainder, read where the motion takes it, and shared among the known views nearest in motion.
@@ -48,6 +54,9 @@ FEWEST = 300  # steps for which a budget in seconds should be enough, or sets ar
 STEP = 4.5  # drawings of its pixels that a training step takes as long as
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
+COMPARED = 4  # one of so many rows of a batch is looked up in another known view
+PARTNERS = 4  # which is one of so many nearest in motion, in turns
+OCCLUDED = 0.05  # rgb: differences well above this count little, they may be another surface
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 
 
@@ -61,12 +70,15 @@ class FastField(Field):
     """
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
-                 margin: float, sharpness: float, entropy: float, smooth: float, remainder: bool) -> None:  # fmt: skip
+                 margin: float, sharpness: float, entropy: float, smooth: float, consistency: float,
+                 remainder: bool) -> None:  # fmt: skip
         super().__init__()
-        self.held: Tensor | None = None  # the penalty of the last call
+        self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
+        self.drawn: tuple[Tensor, ...] = ()
+        self.known: Tensor | None = None
         self.kept: dict[str, tuple[list, Tensor]] = {}
         self.margin, self.sharpness, self.motion = margin, sharpness, motion
-        self.entropy, self.smooth = entropy, smooth
+        self.entropy, self.smooth, self.consistency = entropy, smooth, consistency
         self.pitch = 2 / width
         self.shape, self.active = (sets, layers), sets
         layers *= sets  # those of a set one after the other
@@ -75,21 +87,25 @@ class FastField(Field):
         self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
         halves = [(max(4, h // 2), max(4, w // 2)) for h, w in sizes]
         self.weights = nn.ParameterList(torch.zeros(layers, 1, *half) for half in halves[: max(1, count - 1)])
-        self.delta = nn.Parameter(torch.zeros(layers, 1, *halves[max(0, count - 2)]))
+        self.delta = nn.Parameter(torch.zeros(layers, 2, *halves[max(0, count - 2)]))
         spread = torch.linspace(-1, 1, layers) if layers > 1 else torch.zeros(1)
         self.disparity = nn.Parameter(spread.view(-1, sets).T.flatten())
-        self.shift = nn.Parameter(0.02 * torch.randn(sets, 4, code_dim) / math.sqrt(code_dim))
+        self.shift = nn.Parameter(0.02 * torch.randn(sets, 6, code_dim) / math.sqrt(code_dim))
         self.bend = nn.Parameter(torch.zeros(sets, 4 * (motion - 1), code_dim))
         self.register_buffer("gain", torch.ones(()))
         # half precision: a remainder is small, and a scene's memory should stay near that of its images
         shape = (views, 3, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
-        self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion))
+        self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion + 2))
         self.register_buffer("trust", torch.ones(sets))  # shares of the active sets in what is drawn, once finished
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.register_buffer("decided", torch.zeros((), dtype=torch.long))  # how many sets are left, if so
         self.register_load_state_dict_post_hook(FastField._loaded)
-        self.level, self.decision = count - 1, 1.0
+        self.level, self.step, self.decision = count - 1, 0, 1.0
+
+    def see(self, views: Tensor) -> None:
+        """Holds the known views [n, H, W, 3] that `penalty` compares, and no copy of them."""
+        self.known = views if len(views) > 1 and self.consistency else None
 
     def calibrate(self, codes: Tensor) -> None:
         """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
@@ -126,7 +142,7 @@ class FastField(Field):
         level = next((k for k, (end, last) in enumerate(stages) if progress < end and step < last), count - 1)
         if level != self.level:
             self.kept.clear()
-        self.level = level
+        self.level, self.step = level, step
         self.decision = min(max((progress - 0.3) / 0.3, 0.0), 1.0)
 
     @staticmethod
@@ -178,9 +194,10 @@ class FastField(Field):
         return super().train(mode)
 
     def place(self, z: Tensor) -> Tensor:
-        """The motion's coefficients [V, S, 4 K] under the codes `z` [V, M]: a_k and b_k of every polynomial."""
-        whole, difference = self.shift[: self.active].chunk(2, 1)
-        matrix = torch.cat([whole, whole + difference, self.bend[: self.active]], 1)
+        """The motion's coefficients [V, S, 4 K + 2] under the codes `z` [V, M]: a_k and b_k of every polynomial, c."""
+        whole, difference, other = self.shift[: self.active].split(2, 1)
+        across = torch.stack([-whole[:, 1], whole[:, 0]], 1)
+        matrix = torch.cat([whole, whole + difference, self.bend[: self.active], across + other], 1)
         return F.linear(z * self.gain, matrix.flatten(0, 1)).unflatten(1, matrix.shape[:2])
 
     def basis(self, xy: Tensor) -> Tensor:
@@ -189,11 +206,12 @@ class FastField(Field):
         x, y = xy.unbind(1)
         return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y][: self.motion], 1)
 
-    def carry(self, phi: Tensor, place: Tensor) -> Tensor:
-        """The motions a and b [S, V, 4, P], in units of a texture, from `basis` and `place`."""
-        motion = (place.unflatten(2, (self.motion, 4)) / self.margin).transpose(2, 3)
-        return (motion.flatten(1, 2) @ phi).unflatten(1, motion.shape[1:3]).transpose(0, 1)
-
+    def carry(self, phi: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The motions a and b [S, V, 2, P] and c [S, V, 2, 1], in units of a texture, from `basis` and `place`."""
+        polynomials, c = (place / self.margin).split([4 * self.motion, 2], 2)
+        motion = polynomials.unflatten(2, (self.motion, 4)).transpose(2, 3)
+        a, b = (motion.flatten(1, 2) @ phi).unflatten(1, motion.shape[1:3]).transpose(0, 1).split(2, 2)
+        return a, b, c.transpose(0, 1)[..., None]
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
         """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped.
 
@@ -211,6 +229,7 @@ class FastField(Field):
         finished = not self.training and bool(self.finished)
         mean = self.mean(each) if finished else each.mean(0)
         if self.training and torch.is_grad_enabled():
+            self.drawn = xy, phi, place, seen
             undecided = (1 - weight.square().sum(1)).mean()
             self.held = (each - mean).square().mean() + self.decision * self.entropy * undecided
             self.held = self.held + self.smooth * self.roughness(xy, seen, each)
@@ -219,34 +238,81 @@ class FastField(Field):
 
     def each_set(self, xy: Tensor, phi: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What each set shows at `xy` [V, 2, P] with `basis` and `place`: its colour less 0.5 [S, 3, V, P], its layers'
-        weights [S, L, V, P], and its disparity [S, V, P]."""
-        a, b = self.carry(phi, place)[:, None].split(2, 3)  # [S, 1, V, 2, P]
+        weights [S, L, V, P], and its disparity and drift [S, 2, V, P]."""
+        a, b, c = (part[:, None] for part in self.carry(phi, place))  # [S, 1, V, 2, P]
         disparity = self.disparity.view(*self.shape, 1, 1)[: self.active]
         u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
+        drift = None
         if self.level >= min(2, len(self.colours) - 1):
-            delta = read(self._in_use(self.delta), u).squeeze(2)
+            delta, drift = read(self._in_use(self.delta), u).unbind(2)
             u, disparity = torch.addcmul(u, delta[:, :, :, None], b), disparity + delta
+            u = torch.addcmul(u, drift[:, :, :, None], c)
         colour, weight = read(self.textures(), u).split([3, 1], 2)
         weight = torch.softmax(self.sharpness * weight, 1)
         each, weight = (weight * colour).sum(1), weight.squeeze(2)
-        return each, weight, (weight * disparity).sum(1)
+        seen = (weight * disparity).sum(1)
+        return each, weight, torch.stack([seen, seen * 0 if drift is None else (weight * drift).sum(1)], 1)
 
-    def roughness(self, xy: Tensor, disparity: Tensor, colour: Tensor) -> Tensor:
-        """How much `disparity` [S, V, P] differs between pixels that lie side by side, less where `colour` [S, 3, V, P]
-        does too (as in Godard et al. 2017). Of pixels drawn at random, few lie so; of rows, nearly all."""
+    def roughness(self, xy: Tensor, seen: Tensor, colour: Tensor) -> Tensor:
+        """How much disparity and drift `seen` [S, 2, V, P] differ between pixels that lie side by side, less where
+        `colour` [S, 3, V, P] does too (as in Godard et al. 2017). Of pixels drawn at random few lie so, of rows
+        nearly all."""
         beside = xy.diff(dim=-1).abs().sum(1) < 1.5 * self.pitch
         edge = torch.exp(-EDGE * colour.detach().diff(dim=-1).abs().mean(1))
-        return (disparity.diff(dim=-1).abs() * edge * beside).sum() / disparity.numel()
+        return (seen.diff(dim=-1).abs().sum(1) * edge * beside).sum() / seen[:, 0].numel()
 
-    def penalty(self) -> Tensor:
-        """Three terms on the pixels of the last call.
+    def disagreement(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
+        """How far colours `rgb` [V, P, 3] of the pixels drawn last, of known views number `view` [V], are from those
+        that other known views have where the sets' motion takes these pixels; `codes` [n, M] are the known views'.
+
+        Each view is compared with one of those nearest to it in motion, with another at each step, and at the size of
+        the level in training. Differences are squared while they are small (Charbonnier et al. 1994).
+        """
+        some = slice(self.step % COMPARED, None, COMPARED) if len(view) >= COMPARED else slice(None)
+        xy, phi, place, seen = self.drawn
+        view, rgb, xy, phi, place, seen = view[some], rgb[some], xy[some], phi[some], place[some], seen[:, :, some]
+        places = self.place(codes)
+        with torch.no_grad():
+            apart = torch.cdist(places.flatten(1), places.flatten(1)).fill_diagonal_(math.inf)
+            near = apart.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
+        partner = near[view, self.step // COMPARED % near.shape[1]]
+        a, b, c = self.carry(phi, place - places[partner])
+        disparity, drift = seen[..., None, :].unbind(1)
+        moved = self.margin * torch.addcmul(torch.addcmul(a, disparity, b), drift, c)  # [S, V, 2, P]
+        maps = self._kept("known", [self.known], self._reduced)
+        _, height, width, _ = self.known.shape
+        size = xy.new_tensor([[width], [height]])
+        reduced = 2 ** (len(self.colours) - 1 - self.level)
+
+        def pixel(xy: Tensor) -> Tensor:
+            """Where xy lies in `maps`, counted in their pixels."""
+            return ((xy + 1) * size / 2 + 0.5) / reduced - 0.5
+
+        at = pixel(xy + moved)
+        last = at.new_tensor([[maps.shape[2] - 1], [maps.shape[1] - 1]])
+        inside = ((at >= 0) & (at <= last)).all(2)
+        own = rgb if reduced == 1 else look_up(maps, view, pixel(xy))
+        apart = (look_up(maps, partner, at) - own).square().mean(-1)
+        return OCCLUDED * (((apart + OCCLUDED**2).sqrt() - OCCLUDED) * inside).mean()
+
+    def _reduced(self) -> Tensor:
+        by = 2 ** (len(self.colours) - 1 - self.level)
+        maps = self.known.to(self.shift.dtype)
+        return F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
+
+    def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
+        """Four terms on the pixels of the last call.
 
         How far the sets lie apart, which added to the error of their mean is the mean of their own errors (Krogh and
         Vedelsby 1995). How undecided pixels were between layers: the mean of 1 - sum_l w_l^2, weighted. And
         `roughness`, weighted: where nothing is seen to move, any disparity would do for the known views, but not
-        between them.
+        between them. And `disagreement`, weighted, once the field has seen the known views.
         """
         held, self.held = self.held, None
+        if self.known is not None:
+            with torch.autocast(rgb.device.type, enabled=False):
+                held = held + self.consistency * self.disagreement(view, rgb.to(self.shift.dtype), codes)
+        self.drawn = ()
         return held
 
     def enough(self, steps_per_pass: float) -> float:
@@ -283,12 +349,13 @@ class FastField(Field):
             return each[:, :, 0].unflatten(2, (-1, width)) + 0.5
 
         some, many = slice(None, None, JUDGED), max(1, 65_536 // width)
-        errors = [(shown(z, some) - view[:, some]).square().mean((1, 2, 3)) for view, z in zip(views, codes, strict=True)]
+        pairs = list(zip(views, codes, strict=True))
+        errors = [(shown(z, some) - view[:, some]).square().mean((1, 2, 3)) for view, z in pairs]
         inverse = 1 / torch.stack(errors).mean(0).clamp_min(1e-12)
         self.trust[: self.active] = inverse / inverse.sum()
         if len(self.remainder):
             self.places[:, : self.active] = self.place(codes)
-            for own, view, z in zip(self.remainder, views, codes, strict=True):
+            for own, (view, z) in zip(self.remainder, pairs, strict=True):
                 for rows in (slice(k, k + many) for k in range(0, height, many)):
                     own[:, rows] = view[:, rows] - self.mean(shown(z, rows))
         self.finished.fill_(True)
@@ -299,8 +366,8 @@ class FastField(Field):
         return torch.tensordot(self.trust[: self.active], each, 1)
 
     def shares(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """How much each of the `N` known views nearest to `place` [V, S, 4 K] gives of its remainder: [V, N], summing to
-        1, and which views these are, [V, N].
+        """How much each of the `N` known views nearest to `place` [V, S, 4 K + 2] gives of its remainder: [V, N],
+        summing to 1, and which views these are, [V, N].
 
         A known view's share falls with its distance in motion, and is all of it at its own place; it is gone at the
         distance of the first view that is left out, so that a view enters and leaves a path without a jump (Shepard's
@@ -319,18 +386,20 @@ class FastField(Field):
         near = near**1.5
         return near / near.sum(-1, keepdim=True), views
 
-    def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, disparity: Tensor) -> Tensor:
-        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place`, where the sets with their
-        `disparity` [S, V, P] see them on average, each by its trust."""
+    def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, seen: Tensor) -> Tensor:
+        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place`, where the sets with what is
+        `seen` [S, 2, V, P] of disparity and drift see them on average, each by its trust."""
         shares, views = self.shares(place)
         apart = self.trust[: self.active, None] * (place[:, None] - self.places[views][:, :, : self.active])
-        a, b = apart.unflatten(3, (self.motion, 4)).split(2, 4)  # [V, N, S, K, 2]
-        weights = torch.cat([a.sum(2), b.flatten(2, 3)], 2).transpose(2, 3)
-        scaled = (disparity.movedim(0, 1)[:, :, None] * phi[:, None]).flatten(1, 2)
+        polynomials, c = apart.split([4 * self.motion, 2], 3)
+        a, b = polynomials.unflatten(3, (self.motion, 4)).split(2, 4)  # [V, N, S, K, 2]
+        weights = torch.cat([a.sum(2), b.flatten(2, 3), c], 2).transpose(2, 3)
+        disparity, drift = seen.movedim(2, 0).unbind(2)
+        scaled = (disparity[:, :, None] * phi[:, None]).flatten(1, 2)
         _, _, height, width = self.remainder.shape
         size = xy.new_tensor([[width], [height]])
         scale = size / (size - 1).clamp_min(1)  # pixel centres at both ends, as grid_sample counts
-        motion = (scale * weights).flatten(1, 2) @ torch.cat([phi, scaled], 1)
+        motion = (scale * weights).flatten(1, 2) @ torch.cat([phi, scaled, drift], 1)
         there = ((xy + 1) * scale - 1)[:, None] + motion.unflatten(1, (-1, 2))  # [V, N, 2, P]
         total = xy.new_zeros(len(xy), 3, xy.shape[-1])
         for share, view, at in zip(shares.unbind(1), views.unbind(1), there.unbind(1), strict=True):
@@ -360,3 +429,19 @@ def read(maps: Tensor, u: Tensor) -> Tensor:
 def sample(maps: Tensor, u: Tensor) -> Tensor:
     """Maps [N, C, h, w] read at `u` [N, V, 2, P] in [-1, 1] (corner pixels at the ends), [N, C, V, P]."""
     return F.grid_sample(maps, u.movedim(2, -1), mode="bilinear", padding_mode="border", align_corners=True)
+
+
+def look_up(views: Tensor, which: Tensor, at: Tensor) -> Tensor:
+    """Colours [..., V, P, 3] of the images number `which` [V] of `views` [n, h, w, 3] at `at` [..., V, 2, P], counted
+    in pixels, bilinearly; beyond the border, those at the border. No gradient goes to the images."""
+    _, height, width, _ = views.shape
+    pixels = views.detach().reshape(-1, 3)
+    x, y = at.unbind(-2)
+    x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
+    left, top = x.detach().floor().long(), y.detach().floor().long()
+    right, down = (x - left)[..., None], (y - top)[..., None]
+    first = (which[:, None] * height + top) * width + left
+    beside, below = (left < width - 1).long(), (top < height - 1).long() * width
+    above = torch.lerp(pixels[first], pixels[first + beside], right)
+    under = torch.lerp(pixels[first + below], pixels[first + below + beside], right)
+    return torch.lerp(above, under, down)

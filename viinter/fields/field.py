@@ -44,9 +44,13 @@ class Field(nn.Module):
         """
         return 0.0
 
+    def see(self, views: Tensor) -> None:
+        """Called before the first step, and where training goes on, with the known views [n, H, W, 3]."""
+
     def finish(self, views: Tensor, codes: Tensor) -> None:
         """Called once, after the last step, with the known views [n, H, W, 3] and their codes [n, M]."""
 
-    def penalty(self) -> Tensor | float:
-        """Added to the mean squared error of the pixels that were drawn last; called once a step."""
+    def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor | float:
+        """Added to the mean squared error of the pixels that were drawn last, which have colours `rgb` [V, P, 3] in the
+        known views number `view` [V]; `codes` [n, M] are those of all known views. Called once a step."""
         return 0.0
