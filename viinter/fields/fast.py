@@ -236,6 +236,10 @@ class FastField(Field):
         rgb = mean.movedim(0, -1) + 0.5
         return rgb + self.left_over(xy, phi, place, seen) if finished and len(self.remainder) else rgb
 
+    def mapped(self) -> bool:
+        """Whether disparities and drifts are maps yet, or each layer still moves as a whole."""
+        return self.level >= min(2, len(self.colours) - 1)
+
     def each_set(self, xy: Tensor, phi: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What each set shows at `xy` [V, 2, P] with `basis` and `place`: its colour less 0.5 [S, 3, V, P], its layers'
         weights [S, L, V, P], and its disparity and drift [S, 2, V, P]."""
@@ -243,10 +247,12 @@ class FastField(Field):
         disparity = self.disparity.view(*self.shape, 1, 1)[: self.active]
         u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
         drift = None
-        if self.level >= min(2, len(self.colours) - 1):
+        if self.mapped():
             delta, drift = read(self._in_use(self.delta), u).unbind(2)
             u, disparity = torch.addcmul(u, delta[:, :, :, None], b), disparity + delta
-            u = torch.addcmul(u, drift[:, :, :, None], c)
+            # a product of matrices, since c is the same for all pixels: its gradient is a sum over them
+            c = c.expand(-1, self.shape[1], -1, -1, -1).flatten(0, 2)
+            u = torch.baddbmm(u.flatten(0, 2), c, drift.flatten(0, 2)[:, None]).view(u.shape)
         colour, weight = read(self.textures(), u).split([3, 1], 2)
         weight = torch.softmax(self.sharpness * weight, 1)
         each, weight = (weight * colour).sum(1), weight.squeeze(2)
@@ -306,10 +312,11 @@ class FastField(Field):
         How far the sets lie apart, which added to the error of their mean is the mean of their own errors (Krogh and
         Vedelsby 1995). How undecided pixels were between layers: the mean of 1 - sum_l w_l^2, weighted. And
         `roughness`, weighted: where nothing is seen to move, any disparity would do for the known views, but not
-        between them. And `disagreement`, weighted, once the field has seen the known views.
+        between them. And `disagreement`, weighted, once the field has seen the known views and disparities are maps:
+        before, with sets whose layers move as a whole, it sometimes held a motion that was still wrong.
         """
         held, self.held = self.held, None
-        if self.known is not None:
+        if self.known is not None and self.mapped():
             with torch.autocast(rgb.device.type, enabled=False):
                 held = held + self.consistency * self.disagreement(view, rgb.to(self.shift.dtype), codes)
         self.drawn = ()
