@@ -104,7 +104,7 @@ class FastField(Field):
         self.level, self.step, self.decision = count - 1, 0, 1.0
 
     def see(self, views: Tensor) -> None:
-        """Holds the known views [n, H, W, 3] that `penalty` compares, and no copy of them."""
+        """Holds the known views [n, H, W, 3] that `penalty` compares, and no copy of them, until `finish`."""
         self.known = views if len(views) > 1 and self.consistency else None
 
     def calibrate(self, codes: Tensor) -> None:
@@ -256,8 +256,9 @@ class FastField(Field):
         colour, weight = read(self.textures(), u).split([3, 1], 2)
         weight = torch.softmax(self.sharpness * weight, 1)
         each, weight = (weight * colour).sum(1), weight.squeeze(2)
-        seen = (weight * disparity).sum(1)
-        return each, weight, torch.stack([seen, seen * 0 if drift is None else (weight * drift).sum(1)], 1)
+        disparity = (weight * disparity).sum(1)
+        drift = torch.zeros_like(disparity) if drift is None else (weight * drift).sum(1)
+        return each, weight, torch.stack([disparity, drift], 1)
 
     def roughness(self, xy: Tensor, seen: Tensor, colour: Tensor) -> Tensor:
         """How much disparity and drift `seen` [S, 2, V, P] differ between pixels that lie side by side, less where
@@ -366,6 +367,7 @@ class FastField(Field):
                 for rows in (slice(k, k + many) for k in range(0, height, many)):
                     own[:, rows] = view[:, rows] - self.mean(shown(z, rows))
         self.finished.fill_(True)
+        self.known = None  # nothing is compared any more, and whoever keeps the field need not keep them
         self.train(was)
 
     def mean(self, each: Tensor) -> Tensor:
