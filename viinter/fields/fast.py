@@ -299,8 +299,8 @@ class FastField(Field):
         last = at.new_tensor([[maps.shape[2] - 1], [maps.shape[1] - 1]])
         inside = ((at >= 0) & (at <= last)).all(2)
         own = rgb if reduced == 1 else look_up(maps, view, pixel(xy))
-        apart = (look_up(maps, partner, at) - own).square().mean(-1)
-        return OCCLUDED * (((apart + OCCLUDED**2).sqrt() - OCCLUDED) * inside).mean()
+        error = (look_up(maps, partner, at) - own).square().mean(-1)
+        return OCCLUDED * (((error + OCCLUDED**2).sqrt() - OCCLUDED) * inside).mean()
 
     def _reduced(self) -> Tensor:
         by = 2 ** (len(self.colours) - 1 - self.level)
@@ -311,7 +311,7 @@ class FastField(Field):
         """Four terms on the pixels of the last call.
 
         How far the sets lie apart, which added to the error of their mean is the mean of their own errors (Krogh and
-        Vedelsby 1995). How undecided pixels were between layers: the mean of 1 - sum_l w_l^2, weighted. And
+        Vedelsby 1995). How undecided pixels were between layers: the mean of 1 - sum_l w_l^2, weighted.
         `roughness`, weighted: where nothing is seen to move, any disparity would do for the known views, but not
         between them. And `disagreement`, weighted, once the field has seen the known views and disparities are maps:
         before, with sets whose layers move as a whole, it sometimes held a motion that was still wrong.
@@ -342,7 +342,7 @@ class FastField(Field):
         """Settles how much each set counts, and keeps what the layers leave over of the known views [n, H, W, 3] with
         codes [n, M].
 
-        The mean of guesses whose errors are independent is best with weights that are inverse to their squares.
+        The mean of guesses whose errors are independent is best with weights inverse to the squares of the errors.
         """
         _, height, width, _ = views.shape
         views, codes = views.movedim(-1, 1).to(self.shift.dtype), codes.to(self.shift.dtype)
@@ -442,7 +442,10 @@ def sample(maps: Tensor, u: Tensor) -> Tensor:
 
 def look_up(views: Tensor, which: Tensor, at: Tensor) -> Tensor:
     """Colours [..., V, P, 3] of the images number `which` [V] of `views` [n, h, w, 3] at `at` [..., V, 2, P], counted
-    in pixels, bilinearly; beyond the border, those at the border. No gradient goes to the images."""
+    in pixels, bilinearly; beyond the border, those at the border. No gradient goes to the images.
+
+    Every V has an image of its own: `sample` would have to copy it, or be called once for each image.
+    """
     _, height, width, _ = views.shape
     pixels = views.detach().reshape(-1, 3)
     x, y = at.unbind(-2)
