@@ -212,6 +212,7 @@ class FastField(Field):
         motion = polynomials.unflatten(2, (self.motion, 4)).transpose(2, 3)
         a, b = (motion.flatten(1, 2) @ phi).unflatten(1, motion.shape[1:3]).transpose(0, 1).split(2, 2)
         return a, b, c.transpose(0, 1)[..., None]
+
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
         """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped.
 
