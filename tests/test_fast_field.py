@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from viinter.codes import lerp
+from viinter.fields import fast
 from viinter.fields.fast import FastField, look_up
 from viinter.views import draw, pixel_grid
 
@@ -82,8 +83,9 @@ def test_looking_up_between_pixels_is_bilinear_and_ends_at_the_border(height, wi
 
 
 @pytest.mark.parametrize("progress", [0.0, 0.2, 1.0])  # at 32, 64 and 128 pixels
-def test_known_views_agree_where_the_motion_is_right_and_disagree_where_it_is_not(progress):
+def test_known_views_agree_where_the_motion_is_right_and_disagree_where_it_is_not(progress, monkeypatch):
     """Two views of a smooth picture that slides by 8 pixels."""
+    monkeypatch.setattr(fast, "FEW", 1)  # textures are still empty
     field, codes = make(128, 128), torch.nn.Parameter(torch.stack([torch.zeros(M), torch.eye(M)[0]]))
     wide = torch.sin(torch.arange(136) / 20)[:, None, None].expand(-1, 128, 3).transpose(0, 1) / 2 + 0.5
     views = torch.stack([wide[:, :128], wide[:, 8:]])  # a thing at x in the first is at x - 8 in the second
@@ -107,6 +109,38 @@ def test_known_views_agree_where_the_motion_is_right_and_disagree_where_it_is_no
     still = disagreement(6.0)
     still.backward()
     assert (field.shift.grad[:, 0, 0] < 0).all()  # more of it would be better
+
+
+def test_between_two_views_a_colour_of_either_is_right_and_no_other():
+    """Textures are 0.5 all over, and nothing moves."""
+    field, codes = make(), torch.randn(2, M)
+    torch.nn.init.zeros_(field.shift)
+    xy = pixel_grid(64, 64).T[None]
+    phi, places = field.basis(xy), field.place(codes)
+    field.step = 1
+
+    def between(*colours: float) -> torch.Tensor:
+        field.see(torch.tensor(colours).view(2, 1, 1, 1).expand(2, 64, 64, 3))
+        field.kept.clear()
+        return field.between(torch.tensor([0]), torch.tensor([1]), xy, phi, places)
+
+    assert between(0.5, 0.5) == between(0.5, 0.9) == between(0.2, 0.5) == 0
+    assert 0 < between(0.6, 0.7) < between(0.7, 0.7)
+    between(0.6, 0.7).backward()
+    assert (field.colours[-1].grad.sum((2, 3)) < 0).all()  # brighter would be better
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_only_few_known_views_have_mixes_held_to_them(count, monkeypatch):
+    drawn = []
+    inner = FastField.between
+    monkeypatch.setattr(FastField, "between", lambda *a: drawn.append(a) or inner(*a))
+    field, codes, views = make(views=count), torch.randn(count, M), torch.rand(count, 64, 64, 3)
+    field.see(views)
+    view = torch.arange(count)
+    field(pixel_grid(64, 64).expand(count, -1, -1), codes)
+    assert field.penalty(view, views.flatten(1, 2), codes) > 0
+    assert len(drawn) == (count == 2)
 
 
 def test_what_nothing_is_seen_of_is_not_compared():

@@ -29,7 +29,8 @@ multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which 
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
-takes it in a view nearby (as in Zhou et al. 2017, who learn depth so).
+takes it in a view nearby (as in Zhou et al. 2017, who learn depth so). Of two pictures a view between them is held
+to both in the same way, since nothing else says what there should be.
 
 What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
 view's remainder, read where the motion takes it, and shared among the known views nearest in motion.
@@ -57,6 +58,8 @@ NEAREST = 8  # known views that share in a remainder
 COMPARED = 4  # one of so many rows of a batch is looked up in another known view
 PARTNERS = 4  # which is one of so many nearest in motion, in turns
 OCCLUDED = 0.05  # rgb: differences well above this count little, they may be another surface
+FEW = 2  # known views, for which mixes of codes are held to them too
+GOLDEN = 0.6180339887  # multiples of it, less their whole part, spread evenly over [0, 1] (Weyl 1916)
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 
 
@@ -274,7 +277,7 @@ class FastField(Field):
         that other known views have where the sets' motion takes these pixels; `codes` [n, M] are the known views'.
 
         Each view is compared with one of those nearest to it in motion, with another at each step, and at the size of
-        the level in training. Differences are squared while they are small (Charbonnier et al. 1994).
+        the level in training. Of few known views, mixes with that one are drawn too and held to both.
         """
         some = slice(self.step % COMPARED, None, COMPARED) if len(view) >= COMPARED else slice(None)
         xy, phi, place, seen = self.drawn
@@ -284,28 +287,50 @@ class FastField(Field):
             apart = torch.cdist(places.flatten(1), places.flatten(1)).fill_diagonal_(math.inf)
             near = apart.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
         partner = near[view, self.step // COMPARED % near.shape[1]]
-        a, b, c = self.carry(phi, place - places[partner])
+        there, inside = self.found(partner, places[partner], xy, phi, place, seen)
+        own = rgb if self.level == len(self.colours) - 1 else look_up(self._maps(), view, self._pixel(xy))
+        found = (robust((there - own).square().mean(-1)) * inside).mean()
+        return found + self.between(view, partner, xy, phi, places) if len(codes) <= FEW else found
+
+    def between(self, view: Tensor, partner: Tensor, xy: Tensor, phi: Tensor, places: Tensor) -> Tensor:
+        """How far what each set shows at `xy` [V, 2, P] of a view between the known views number `view` and `partner`
+        [V], at `places` [n, S, 4 K + 2], is from what the better of these two has where the motion takes it: what one
+        of them does not see the other mostly does (as in Godard et al. 2019)."""
+        place = torch.lerp(places[view], places[partner], self.step * GOLDEN % 1)
+        each, _, seen = self.each_set(xy, phi, place)
+        each, errors = each.movedim(1, -1) + 0.5, []
+        for known in (view, partner):
+            there, inside = self.found(known, places[known], xy, phi, place, seen)
+            errors.append((there - each).square().mean(-1).masked_fill(~inside, math.inf))
+        error = torch.minimum(*errors)
+        return robust(error.masked_fill(error.isinf(), 0)).mean()
+
+    def found(self, known: Tensor, at: Tensor, xy: Tensor, phi: Tensor, place: Tensor,
+              seen: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Colours [S, V, P, 3] that the known views number `known` [V], `at` [V, S, 4 K + 2], have where the motion
+        takes the pixels `xy` [V, 2, P] of views at `place` with what is `seen` [S, 2, V, P] there; and whether that
+        is inside the view [S, V, P]."""
+        a, b, c = self.carry(phi, place - at)
         disparity, drift = seen[..., None, :].unbind(1)
         moved = self.margin * torch.addcmul(torch.addcmul(a, disparity, b), drift, c)  # [S, V, 2, P]
-        maps = self._kept("known", [self.known], self._reduced)
+        maps, there = self._maps(), self._pixel(xy + moved)
+        last = there.new_tensor([[maps.shape[2] - 1], [maps.shape[1] - 1]])
+        return look_up(maps, known, there), ((there >= 0) & (there <= last)).all(2)
+
+    def _pixel(self, xy: Tensor) -> Tensor:
+        """Where `xy` [..., 2, P] lies in the known views at the size of the level, counted in their pixels."""
         _, height, width, _ = self.known.shape
-        size = xy.new_tensor([[width], [height]])
-        reduced = 2 ** (len(self.colours) - 1 - self.level)
+        return ((xy + 1) * xy.new_tensor([[width], [height]]) / 2 + 0.5) / self._reduction() - 0.5
 
-        def pixel(xy: Tensor) -> Tensor:
-            """Where xy lies in `maps`, counted in their pixels."""
-            return ((xy + 1) * size / 2 + 0.5) / reduced - 0.5
+    def _reduction(self) -> int:
+        return 2 ** (len(self.colours) - 1 - self.level)
 
-        at = pixel(xy + moved)
-        last = at.new_tensor([[maps.shape[2] - 1], [maps.shape[1] - 1]])
-        inside = ((at >= 0) & (at <= last)).all(2)
-        own = rgb if reduced == 1 else look_up(maps, view, pixel(xy))
-        error = (look_up(maps, partner, at) - own).square().mean(-1)
-        return OCCLUDED * (((error + OCCLUDED**2).sqrt() - OCCLUDED) * inside).mean()
+    def _maps(self) -> Tensor:
+        """The known views [n, h, w, 3] at the size of the level in training."""
+        return self._kept("known", [self.known], self._reduced)
 
     def _reduced(self) -> Tensor:
-        by = 2 ** (len(self.colours) - 1 - self.level)
-        maps = self.known.to(self.shift.dtype)
+        by, maps = self._reduction(), self.known.to(self.shift.dtype)
         return F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
 
     def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
@@ -439,6 +464,12 @@ def read(maps: Tensor, u: Tensor) -> Tensor:
 def sample(maps: Tensor, u: Tensor) -> Tensor:
     """Maps [N, C, h, w] read at `u` [N, V, 2, P] in [-1, 1] (corner pixels at the ends), [N, C, V, P]."""
     return F.grid_sample(maps, u.movedim(2, -1), mode="bilinear", padding_mode="border", align_corners=True)
+
+
+def robust(error: Tensor) -> Tensor:
+    """Half of a squared difference of colours as long as it is small, and less of a large one, which may be another
+    surface (Charbonnier et al. 1994)."""
+    return OCCLUDED * ((error + OCCLUDED**2).sqrt() - OCCLUDED)
 
 
 def look_up(views: Tensor, which: Tensor, at: Tensor) -> Tensor:
