@@ -130,7 +130,7 @@ def test_between_two_views_a_colour_of_either_is_right_and_no_other():
     assert (field.colours[-1].grad.sum((2, 3)) < 0).all()  # brighter would be better
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", [2, 4, 5])
 def test_only_few_known_views_have_mixes_held_to_them(count, monkeypatch):
     drawn = []
     inner = FastField.between
@@ -140,7 +140,7 @@ def test_only_few_known_views_have_mixes_held_to_them(count, monkeypatch):
     view = torch.arange(count)
     field(pixel_grid(64, 64).expand(count, -1, -1), codes)
     assert field.penalty(view, views.flatten(1, 2), codes) > 0
-    assert len(drawn) == (count == 2)
+    assert len(drawn) == (count <= 4)
 
 
 def test_what_nothing_is_seen_of_is_not_compared():

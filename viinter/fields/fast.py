@@ -29,8 +29,8 @@ multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which 
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
-takes it in a view nearby (as in Zhou et al. 2017, who learn depth so). Of two pictures a view between them is held
-to both in the same way, since nothing else says what there should be.
+takes it in a view nearby (as in Zhou et al. 2017, who learn depth so). Of few pictures a view between two is held to
+both in the same way, since nothing else says what there should be.
 
 What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
 view's remainder, read where the motion takes it, and shared among the known views nearest in motion.
@@ -58,7 +58,7 @@ NEAREST = 8  # known views that share in a remainder
 COMPARED = 4  # one of so many rows of a batch is looked up in another known view
 PARTNERS = 4  # which is one of so many nearest in motion, in turns
 OCCLUDED = 0.05  # rgb: differences well above this count little, they may be another surface
-FEW = 2  # known views, for which mixes of codes are held to them too
+FEW = 4  # known views at most, if mixes of their codes are held to them too
 GOLDEN = 0.6180339887  # multiples of it, less their whole part, spread evenly over [0, 1] (Weyl 1916)
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 
@@ -277,7 +277,7 @@ class FastField(Field):
         that other known views have where the sets' motion takes these pixels; `codes` [n, M] are the known views'.
 
         Each view is compared with one of those nearest to it in motion, with another at each step, and at the size of
-        the level in training. Of few known views, mixes with that one are drawn too and held to both.
+        the level in training. Of few known views, a mix with that one is drawn too and held to both.
         """
         some = slice(self.step % COMPARED, None, COMPARED) if len(view) >= COMPARED else slice(None)
         xy, phi, place, seen = self.drawn
