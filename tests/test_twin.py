@@ -33,11 +33,16 @@ def test_the_fast_field_in_float32(make_config, values):
     assert 0 < found["gradient"] < 1e-2
 
 
+@pytest.mark.parametrize(("few", "bound"), [(0, 1e-5), (twin.VIEWS, 2e-5)])
 @pytest.mark.parametrize("layers", [4, 16])
 def test_the_fast_field_s_gradient_is_off_only_where_a_pixel_lies_on_the_border_of_a_texel(
-    make_config, monkeypatch, layers
+    make_config, monkeypatch, layers, few, bound
 ):
-    """Bilinear reading has a kink there, and float32 may see the pixel on the other side. Without those it is exact."""
+    """Bilinear reading has a kink there, and float32 may see the pixel on the other side. Without those it is exact.
+
+    Views between few known views add two readings of white noise to the one at known codes, and half as much again.
+    """
+    monkeypatch.setattr(fast, "FEW", few)
     model, batch = twin.model_and_batch(make_config(**FAST, **{"model.layers": layers}))
     double, inside, inner = copy.deepcopy(model).double(), {}, fast.sample
 
@@ -55,7 +60,7 @@ def test_the_fast_field_s_gradient_is_off_only_where_a_pixel_lies_on_the_border_
     assert same.float().mean() > 0.99
     batch = PixelBatch(batch.view, batch.xy[:, same], batch.rgb[:, same])
     exact = twin.values_and_gradients(double, PixelBatch(batch.view, batch.xy.double(), batch.rgb.double()))
-    assert twin.relative(twin.values_and_gradients(model, batch)[2], exact[2]) < 1e-5
+    assert twin.relative(twin.values_and_gradients(model, batch)[2], exact[2]) < bound
 
 
 def test_mixed_precision_is_further_off_but_not_far(make_config):
