@@ -284,13 +284,13 @@ class FastField(Field):
         view, rgb, xy, phi, place, seen = view[some], rgb[some], xy[some], phi[some], place[some], seen[:, :, some]
         places = self.place(codes)
         with torch.no_grad():
-            apart = torch.cdist(places.flatten(1), places.flatten(1)).fill_diagonal_(math.inf)
-            near = apart.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
+            distances = torch.cdist(places.flatten(1), places.flatten(1)).fill_diagonal_(math.inf)
+            near = distances.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
         partner = near[view, self.step // COMPARED % near.shape[1]]
-        there, inside = self.found(partner, places[partner], xy, phi, place, seen)
-        own = rgb if self.level == len(self.colours) - 1 else look_up(self._maps(), view, self._pixel(xy))
-        found = (robust((there - own).square().mean(-1)) * inside).mean()
-        return found + self.between(view, partner, xy, phi, places) if len(codes) <= FEW else found
+        there, inside = self.found(partner, places, xy, phi, place, seen)
+        own = rgb if self._reduction() == 1 else look_up(self._maps(), view, self._pixel(xy))
+        apart = (robust((there - own).square().mean(-1)) * inside).mean()
+        return apart + self.between(view, partner, xy, phi, places) if len(codes) <= FEW else apart
 
     def between(self, view: Tensor, partner: Tensor, xy: Tensor, phi: Tensor, places: Tensor) -> Tensor:
         """How far what each set shows at `xy` [V, 2, P] of a view between the known views number `view` and `partner`
@@ -300,17 +300,17 @@ class FastField(Field):
         each, _, seen = self.each_set(xy, phi, place)
         each, errors = each.movedim(1, -1) + 0.5, []
         for known in (view, partner):
-            there, inside = self.found(known, places[known], xy, phi, place, seen)
+            there, inside = self.found(known, places, xy, phi, place, seen)
             errors.append((there - each).square().mean(-1).masked_fill(~inside, math.inf))
         error = torch.minimum(*errors)
         return robust(error.masked_fill(error.isinf(), 0)).mean()
 
-    def found(self, known: Tensor, at: Tensor, xy: Tensor, phi: Tensor, place: Tensor,
+    def found(self, known: Tensor, places: Tensor, xy: Tensor, phi: Tensor, place: Tensor,
               seen: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Colours [S, V, P, 3] that the known views number `known` [V], `at` [V, S, 4 K + 2], have where the motion
-        takes the pixels `xy` [V, 2, P] of views at `place` with what is `seen` [S, 2, V, P] there; and whether that
-        is inside the view [S, V, P]."""
-        a, b, c = self.carry(phi, place - at)
+        """Colours [S, V, P, 3] that the known views number `known` [V] of those at `places` [n, S, 4 K + 2] have where
+        the motion takes the pixels `xy` [V, 2, P] of views at `place` [V, S, 4 K + 2] with what is `seen` [S, 2, V, P]
+        there; and whether that is inside the view [S, V, P]."""
+        a, b, c = self.carry(phi, place - places[known])
         disparity, drift = seen[..., None, :].unbind(1)
         moved = self.margin * torch.addcmul(torch.addcmul(a, disparity, b), drift, c)  # [S, V, 2, P]
         maps, there = self._maps(), self._pixel(xy + moved)
@@ -323,6 +323,7 @@ class FastField(Field):
         return ((xy + 1) * xy.new_tensor([[width], [height]]) / 2 + 0.5) / self._reduction() - 0.5
 
     def _reduction(self) -> int:
+        """How many times smaller than the known views those of the level in training are."""
         return 2 ** (len(self.colours) - 1 - self.level)
 
     def _maps(self) -> Tensor:
@@ -467,7 +468,7 @@ def sample(maps: Tensor, u: Tensor) -> Tensor:
 
 
 def robust(error: Tensor) -> Tensor:
-    """Half of a squared difference of colours as long as it is small, and less of a large one, which may be another
+    """Half of a squared difference of colours while it is small, and less of a large one, which may be that to another
     surface (Charbonnier et al. 1994)."""
     return OCCLUDED * ((error + OCCLUDED**2).sqrt() - OCCLUDED)
 
