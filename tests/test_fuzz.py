@@ -94,7 +94,7 @@ def saved(save, value) -> bytes:
 def test_any_bytes_are_poses_or_refused(tmp_path, data):
     file = tmp_path / "poses_bounds.npy"
     file.write_bytes(data)
-    accepted_or_answered(lambda: scenes._camera_centres(file, 3))
+    accepted_or_answered(lambda: scenes._cameras(file, 3))
 
 
 CHECKPOINT = {"config": {}, "about": {}, "state_dict": {"a": torch.zeros(2)}, "global_step": 1}

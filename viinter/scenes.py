@@ -9,7 +9,8 @@ Which views are known (DESIGN's Protocol; supplement, "Dataset Details"), with `
 
 planar   rows and columns that are multiples of 4: 25 of the Stanford archive's 17x17. Probes: "novel",
          the axis midpoints; "novel_cells", the cell centres; "novel_quarters", the axis quarter points.
-llff     all but every 8th image; its mix lies on the segment between the two known cameras nearest to it.
+llff     all but every 8th image. As "novel" its mix lies on the segment between the two known cameras nearest to
+         it; as "novel_posed" it is all cameras, weighted so that their poses come to its own.
 studio   all but every 8th image in file order; its mix is the half of both neighbours. Masks give the crop.
 folder   as studio without masks, but only from 9 images on; fewer are all known.
 pair     both.
@@ -39,6 +40,8 @@ Place = tuple[int, int]  # (r, c)
 
 STEP = 4  # rows and columns from one known view of a planar grid to the next (Protocol)
 EVERY, FIRST = 8, 4  # in file order every 8th image is held out, beginning with index 4 (Protocol)
+FARTHEST = 1e30  # of any number in a pose: its fourth power is still finite
+POSE_ERROR = 1e-3  # of the distance between cameras, and radians: weights need not reproduce a pose more closely
 FEWEST = 9  # images that a folder must hold before any is held out
 ARCHIVES = {Layout.planar: "stanford", Layout.llff: "llff"}  # groups of conf/scene that have a public address
 
@@ -52,7 +55,7 @@ class Probe:
     """A held-out view and the known views that stand for it.
 
     target: `[H, W, 3]`, float32 in [0, 1].
-    mix: `((known index, weight), ...)`, weights in [0, 1] that sum to 1.
+    mix: `((known index, weight), ...)`, weights that sum to 1, in [0, 1] but for those of "novel_posed".
     name: the target's file name.
     """
 
@@ -67,7 +70,8 @@ class Scene:
 
     views: `[n, H, W, 3]`, float32 in [0, 1], the known views; names: their file names, in the same order.
     probes: by kind. "novel" is always there, perhaps empty; planar scenes with probes add "novel_cells" and
-        "novel_quarters". left_out: for the same kinds, how many probes have no target file.
+        "novel_quarters", LLFF scenes with poses "novel_posed". left_out: for the same kinds, how many probes have no
+        target file.
     white: the value that is 1.0 in `views`, not 1 only where `scene.out_of_range=scale` divided the images.
     endpoints: two known indices, for demonstrations.
     notes: plain sentences on where things came from and what was dropped.
@@ -113,8 +117,8 @@ class Plan:
 
     @property
     def files(self) -> list[Path]:
-        """All the files to read: known views, then probes by kind."""
-        return self.known + [file for probes in self.held.values() for file, _ in probes]
+        """All the files to read, each once: known views, then probes by kind."""
+        return list(dict.fromkeys(self.known + [file for probes in self.held.values() for file, _ in probes]))
 
 
 def load(cfg: SceneConfig) -> Scene:
@@ -153,8 +157,8 @@ def load(cfg: SceneConfig) -> Scene:
 
     n = len(plan.known)
     white = _into_range(views, files, n, cfg.out_of_range, notes)
-    targets = iter(views[n:])
-    probes = {kind: [Probe(next(targets), mix, file.name) for file, mix in held] for kind, held in plan.held.items()}
+    of = dict(zip(files, views, strict=True))
+    probes = {kind: [Probe(of[file], mix, file.name) for file, mix in held] for kind, held in plan.held.items()}
     known = torch.stack(views[:n])
     names = [file.name for file in plan.known]
     return Scene(cfg.name, cfg.layout, known, names, probes, dict(plan.left_out), white, endpoints, notes)
@@ -216,9 +220,9 @@ def planar(cfg: SceneConfig, root: Path) -> Plan:
 def llff(cfg: SceneConfig, root: Path) -> Plan:
     """Photographs in `root/<cfg.images>` (null: images_4, else images_8, else images), by file name.
 
-    Every 8th image from index 4 on, but the last, is a probe; its mix is `nearest_mix` of the camera centres
-    in `root/poses_bounds.npy`, or, without that file, the half of both neighbours. Nothing else reads the
-    poses.
+    Every 8th image from index 4 on, but the last, is a probe; its mix is `nearest_mix`, and once more
+    `posed_mix`, of the cameras in `root/poses_bounds.npy`, or, without that file, the half of both neighbours.
+    Nothing else reads the poses.
     """
     folders = [cfg.images] if cfg.images else ["images_4", "images_8", "images"]
     found = [root / name for name in folders if (root / name).is_dir()]
@@ -235,9 +239,13 @@ def llff(cfg: SceneConfig, root: Path) -> Plan:
     if not poses.is_file():
         notes.append("There is no poses_bounds.npy: probes lie half-way between neighbours in file order.")
         return _every_eighth(files, notes)
-    centres = _camera_centres(poses, len(files))
-    notes.append("Camera centres in poses_bounds.npy place the probes between known views.")
-    return _every_eighth(files, notes, lambda target, known: nearest_mix(centres[target], centres[known]))
+    cameras = _cameras(poses, len(files))
+    notes.append("Camera poses in poses_bounds.npy place the probes between known views.")
+    centres = cameras[:, :, 3]
+    return _every_eighth(files, notes, {
+        "novel": lambda target, known: nearest_mix(centres[target], centres[known]),
+        "novel_posed": lambda target, known: posed_mix(cameras[target], cameras[known]),
+    })  # fmt: skip
 
 
 def studio(cfg: SceneConfig, root: Path) -> Plan:
@@ -330,6 +338,26 @@ def nearest_mix(target: np.ndarray, known: np.ndarray) -> Mix:
     return (int(i), 1.0 - t), (int(j), t)
 
 
+def posed_mix(target: np.ndarray, known: np.ndarray) -> Mix:
+    """All of `known`, weighted so that the small motions from `target` to each of them cancel out.
+
+    A probe rarely stands between two known cameras, and never looks quite where they do. But for small motions a
+    picture changes linearly with its camera's translation and rotation (Longuet-Higgins and Prazdny 1980), so that
+    a field with codes in proportion to the cameras draws the probe at that combination of codes which is its pose's of
+    the known poses. Of many such combinations this is the one with the smallest squares.
+
+    target [3, 4], known [n, 3, 4]: three axes in columns, then the centre; the world's unit and axes do not matter.
+    The weights sum to 1 and may be negative.
+    """
+    apart = known[:, :, 3] - target[:, 3]
+    apart = apart / (np.linalg.norm(apart, axis=1).mean() or 1.0)
+    turned = target[:, :3].T @ known[:, :, :3]
+    turned = (turned - turned.transpose(0, 2, 1)) / 2  # the axis of rotation, by the sine of its angle
+    motion = np.hstack([apart, turned[:, [0, 0, 1], [1, 2, 2]]])
+    weights = np.linalg.solve(motion @ motion.T + POSE_ERROR**2 * np.eye(len(known)), np.ones(len(known)))
+    return tuple(enumerate((weights / weights.sum()).tolist()))
+
+
 def _between(rows: range, columns: range) -> dict[str, dict[Place, list[tuple[Place, float]]]]:
     """For each kind of planar probe, its places, and for each the known places, with weights, around it."""
     axes = [((r, c), (r, c + STEP)) for r in rows for c in columns[:-1]]
@@ -346,22 +374,23 @@ def _between(rows: range, columns: range) -> dict[str, dict[Place, list[tuple[Pl
     return kinds
 
 
-def _every_eighth(files: list[Path], notes: list[str], mix: Callable[[int, list[int]], Mix] | None = None) -> Plan:
+def _every_eighth(
+    files: list[Path], notes: list[str], mixes: dict[str, Callable[[int, list[int]], Mix]] | None = None
+) -> Plan:
     """Holds out the file indices 4, 12, 20, ..., each with a file on both sides, so never the last.
 
-    mix: from a held-out file index and the known file indices to its mix; None: the half of both neighbours.
-    notes: becomes the plan's, one sentence longer.
+    mixes: for each kind of probe, from a held-out file index and the known file indices to its mix; None: "novel", the
+    half of both neighbours. notes: becomes the plan's, one sentence longer.
     """
     held = range(FIRST, len(files) - 1, EVERY)
     known = [i for i in range(len(files)) if i not in held]
-    if mix is None:
 
-        def mix(target: int, known: list[int]) -> Mix:
-            return (known.index(target - 1), 0.5), (known.index(target + 1), 0.5)
+    def half(target: int, known: list[int]) -> Mix:
+        return (known.index(target - 1), 0.5), (known.index(target + 1), 0.5)
 
     notes.append(f"Held out are {len(held)} of {len(files)} images, every {EVERY}th from index {FIRST} on.")
-    probes = [(files[i], mix(i, known)) for i in held]
-    return Plan([files[i] for i in known], {"novel": probes}, {"novel": 0}, notes)
+    probes = {kind: [(files[i], mix(i, known)) for i in held] for kind, mix in (mixes or {"novel": half}).items()}
+    return Plan([files[i] for i in known], probes, dict.fromkeys(probes, 0), notes)
 
 
 def _first(cfg: SceneConfig, files: list[Path], notes: list[str]) -> Plan:
@@ -372,10 +401,11 @@ def _first(cfg: SceneConfig, files: list[Path], notes: list[str]) -> Plan:
     return Plan(files[: cfg.max_views], notes=notes)
 
 
-def _camera_centres(file: Path, count: int) -> np.ndarray:
-    """Camera centres [count, 3] from LLFF's poses, a row [17] for each image.
+def _cameras(file: Path, count: int) -> np.ndarray:
+    """Cameras [count, 3, 4] from LLFF's poses, a row [17] for each image: three axes in columns, then the centre.
 
-    A row is a 3x5 matrix, whose 4th column is the centre, then the nearest and the farthest depth.
+    A row is a 3x5 matrix, whose 5th column is the image's size and focal length, then the nearest and the farthest
+    depth.
     """
     remedy = "put the right file there, or remove it: probes then lie between their neighbours in file order"
     try:
@@ -388,14 +418,14 @@ def _camera_centres(file: Path, count: int) -> np.ndarray:
         raise SceneError(f"{file}: {found}; expected numbers of shape [{count}, 17]: {remedy}")
     if len(poses) != count:
         raise SceneError(f"{file}: {len(poses)} rows for {count} images; expected a row for each: {remedy}")
-    centres = poses[:, :15].reshape(-1, 3, 5)[:, :, 3].astype(np.float64)
-    wrong = np.flatnonzero(~np.isfinite(centres).all(axis=1))
+    cameras = poses[:, :15].reshape(-1, 3, 5)[:, :, :4].astype(np.float64)
+    wrong = np.flatnonzero(~(np.abs(cameras) < FARTHEST).all(axis=(1, 2)))
     if len(wrong):
         raise SceneError(
-            f"{file}: the camera centre of image {wrong[0]} is {centres[wrong[0]].tolist()}; "
-            f"expected finite numbers: {remedy}"
+            f"{file}: the camera of image {wrong[0]} has axes and centre {cameras[wrong[0]].tolist()}; "
+            f"expected numbers below {FARTHEST:g}: {remedy}"
         )
-    return centres
+    return cameras
 
 
 def _multiples(low: int, high: int) -> range:
