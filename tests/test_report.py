@@ -86,6 +86,22 @@ def test_a_table_as_the_papers_keeps_a_column_that_has_no_run():
     assert found.rows[7] == ["novel PSNR", "here", *["- (no such job)"] * 4, "22.00"]
 
 
+def test_codes_of_the_probes_stand_side_by_side():
+    """Columns that no run has are left out; planar runs without finetuned codes are no part of it."""
+    posed, bare = run_with(15.0, **{"scene.name": "fern"}), run_with(30.0, **{"scene.name": "knights"})
+    assert comparisons.probe_codes([bare], published()) is None
+    posed.metrics["novel_posed"] = {"psnr": 24.5, "ssim": 0.8}
+    found = comparisons.probe_codes([posed, bare], published())
+    assert found.columns == ["scene", "SSIM interpolated", "SSIM posed", "PSNR interpolated", "PSNR posed",
+                             "finetuned gains dB"]  # fmt: skip
+    assert found.rows[0] == ["fern", "0.500", "0.800", "15.00", "24.50", "-"]
+    assert [row[0] for row in found.rows[1:]] == ["paper, planar", "paper, unstructured"]
+    bare.evaluation = {"finetuned": {"psnr": 30.5, "ssim": 0.6}}
+    found = comparisons.probe_codes([posed, bare], published())
+    assert found.rows[1] == ["knights", "0.500", "- (not measured)", "0.600", "30.00", "- (not measured)", "30.50",
+                             "+0.50"]  # fmt: skip
+
+
 # Sweeps with holes
 
 

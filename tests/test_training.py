@@ -72,6 +72,16 @@ def test_real_scenes_train(make_config, shared_data, tmp_path, layout, name, val
     assert 0 < found["known"]["psnr"] < 100
 
 
+def test_photographs_are_drawn_where_their_cameras_stood(make_config, shared_data, tmp_path):
+    """Codes come out in proportion to the cameras: their poses, which training never saw, say what a probe's is."""
+    found = train(make_config("llff", shared_data("llff/fern"), **{
+        "model": "fast", "scene.images": "images_8", "scene.downsample": 4, "interpolation.alpha": 0,
+        "model.code_dim": 128, "optim.steps": 80, "optim.lr": 0.02, "optim.lr_decay": 0.05, "optim.beta2": 0.99,
+        "optim.batch_pixels": 16384, "optim.pixels_from": "rows",
+    }), tmp_path)  # fmt: skip
+    assert found["novel_posed"]["psnr"] > found["novel"]["psnr"] + 4
+
+
 # Repeating and resuming
 
 

@@ -157,21 +157,30 @@ def towers(runs: list[Run], paper: dict[str, Any]) -> Table:
     return Table("L_inter by tower", columns, rows, [f"Paper: {cost['source']}. Here: {marked(runs)}."])
 
 
-def finetuned(runs: list[Run], paper: dict[str, Any]) -> Table:
-    """Interpolated against finetuned codes at the standard probes, for runs that `viinter.evaluate` has measured."""
-    measured = [run for run in runs if run.value("finetuned", "psnr") is not None]
+CODES = {"novel": "interpolated", "novel_posed": "posed", "finetuned": "finetuned"}  # what gave a probe its code
+
+
+def probe_codes(runs: list[Run], paper: dict[str, Any]) -> Table | None:
+    """The same probes under interpolated codes, codes placed by all cameras' poses, and codes finetuned by
+    `viinter.evaluate`, for runs that have one of the last two; None if there are none."""
+    measured = [run for run in runs if any(run.value(kind, "psnr") is not None for kind in list(CODES)[1:])]
+    if not measured:
+        return None
+    kinds = [kind for kind in CODES if any(run.value(kind, "psnr") is not None for run in measured)]
+    both = [(number, kind) for number in ("ssim", "psnr") for kind in kinds]
     rows = []
     for name, of in grouped(measured, "scene.name").items():
-        line = [cell(of, kind, number) for number in ("ssim", "psnr") for kind in ("novel", "finetuned")]
-        gain = statistics.fmean(run.value("finetuned", "psnr") - run.value("novel", "psnr") for run in of)
-        rows.append([name, *line, f"{gain:+.2f}"])
+        gains = [b - a for run in of if (a := run.value("novel", "psnr")) and (b := run.value("finetuned", "psnr"))]
+        gain = f"{statistics.fmean(gains):+.2f}" if gains else "-"
+        rows.append([name, *(cell(of, kind, number) for number, kind in both), gain])
     for layout in ("planar", "unstructured"):
-        of = paper["table_3"][layout]
-        line = [f"{of[m][n]:.{DIGITS[n]}f}" for n in ("ssim", "psnr") for m in ("ours", "finetuned")]
-        rows.append([f"paper, {layout}", *line, f"{of['finetuned']['psnr'] - of['ours']['psnr']:+.2f}"])
-    columns = ["scene", "SSIM interpolated", "SSIM finetuned", "PSNR interpolated", "PSNR finetuned", "gain dB"]
+        printed = paper["table_3"][layout]
+        of = {"novel": printed["ours"], "finetuned": printed["finetuned"]}
+        line = [f"{of[kind][number]:.{DIGITS[number]}f}" if kind in of else "" for number, kind in both]
+        rows.append([f"paper, {layout}", *line, f"{of['finetuned']['psnr'] - of['novel']['psnr']:+.2f}"])
+    columns = ["scene", *(f"{UNITS[number]} {CODES[kind]}" for number, kind in both), "finetuned gains dB"]
     notes = [f"Paper: {paper['table_3']['source']}. Here: {marked(measured)}.", SSIM_NOTE]
-    return Table("Finetuned codes", columns, rows, notes)
+    return Table("Codes of the probes", columns, rows, notes)
 
 
 def every_run(runs: list[Run], keys: list[str]) -> Table:

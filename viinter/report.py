@@ -48,8 +48,8 @@ def report(folders: list[str | Path], out: Path) -> list[Path]:
         title, items = EXPERIMENTS.get(experiment, ("Runs", lambda *_: []))
         section = Section(experiment or "runs", title, items(of, paper))
         section.items += against_time(of)
-        if any(run.evaluation for run in of):
-            section.items.append(comparisons.finetuned(of, paper))
+        if codes := comparisons.probe_codes(of, paper):
+            section.items.append(codes)
         section.items.append(comparisons.every_run(of, varied(of)))
         missing = [f"`{run.folder}` ({' '.join(run.overrides)}): {run.missing}" for run in of if run.missing]
         section.items += [f"Missing and failed: {len(missing)} of {len(of)}.", *missing] if missing else []

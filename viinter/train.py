@@ -304,8 +304,8 @@ def show(
 def summary(metrics: dict[str, Any], run_dir: Path) -> str:
     """The result in a few lines, with the places to look."""
     lines = []
-    for kind, text in (("known", "known views"), ("novel", "probes")):
-        if (found := metrics[kind])["per_view"]:
+    for kind, text in (("known", "known views"), ("novel", "probes"), ("novel_posed", "posed probes")):
+        if (found := metrics.get(kind)) and found["per_view"]:
             psnr = "no finite PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"
             ssim = "no SSIM" if found["ssim"] is None else f"SSIM {found['ssim']:.4f}"
             every = metrics["measured_every"][kind]
