@@ -107,7 +107,8 @@ def test_the_papers_scenes_are_one_sweep_and_those_that_are_not_there_are_shown_
     assert len(rows) == 2  # known and novel
     assert all("[failed: " in row for row in rows)
     assert f"| {there[0]} |" in page
-    assert "gain dB" in page
+    assert "finetuned gains dB" in page
+    assert ("PSNR posed" in page) == (experiment == "unstructured")
 
 
 def test_the_feature_towers_are_one_sweep(command_line, archive, vgg_weights, tmp_path):
