@@ -70,6 +70,8 @@ def check_scene(scene: scenes.Scene) -> None:
     targets = [probe.name for kind, probes in scene.probes.items() for probe in probes if kind != "novel_posed"]
     assert len(targets) == len(set(targets))
     assert not set(targets) & set(scene.names)
+    posed = [probe.name for probe in scene.probes.get("novel_posed", [])]
+    assert posed in ([], [probe.name for probe in scene.probes["novel"]])
     for kind, probes in scene.probes.items():
         for probe in probes:
             assert probe.target.shape == scene.views.shape[1:]
@@ -297,6 +299,16 @@ def test_posed_mixes(seed, n):
     assert [weight for _, weight in again] == pytest.approx(weights.tolist(), abs=1e-6)
 
 
+@given(
+    arrays(np.float64, (9, 3, 3), elements=st.floats(-1, 1)),
+    arrays(np.float64, (9, 3), elements=st.floats(-1e29, 1e29)),
+)
+def test_any_cameras_have_a_posed_mix(axes, centres):
+    target, *known = np.concatenate([axes, centres[:, :, None]], 2)
+    weights = np.array([weight for _, weight in posed_mix(target, np.array(known))])
+    assert weights.sum() == pytest.approx(1, abs=1e-6)
+
+
 def test_posed_mix_in_the_middle_and_at_one_place():
     ends = cameras(np.array([[0.0, 0, 0], [2, 0, 0]]), np.array([[0, 0.1, 0], [0, -0.1, 0]]))
     (middle,) = cameras(np.array([[1.0, 0, 0]]), np.zeros((1, 3)))
@@ -371,7 +383,14 @@ def test_holdout_none_takes_the_first_views_and_reads_no_poses(tmp_path):
         (np.zeros((14, 15)), r"float64 of shape \[14, 15\]; expected numbers of shape \[14, 17\]"),
         (np.zeros(14), r"shape \[14\]"),
         (np.full((14, 17), "x"), "<U1 of shape"),
-        (np.where(np.arange(17) == 8, np.nan, np.zeros((14, 17))), r"image 0 has .*nan\].* below 1e\+30"),
+        (
+            np.where(np.arange(17) == 8, np.nan, np.zeros((14, 17))),
+            r"image 0 has .* \[0.0, 0.0, 0.0, nan\], .* below 1e\+30",
+        ),
+        (
+            np.where(np.arange(17) == 6, 1e4, np.zeros((14, 17))),
+            r"image 0 has .* \[0.0, 10000.0, 0.0, 0.0\], .* length 1",
+        ),
         (np.array([{}] * 14), "allow_pickle"),
     ],
 )

@@ -170,7 +170,9 @@ def probe_codes(runs: list[Run], paper: dict[str, Any]) -> Table | None:
     both = [(number, kind) for number in ("ssim", "psnr") for kind in kinds]
     rows = []
     for name, of in grouped(measured, "scene.name").items():
-        gains = [b - a for run in of if (a := run.value("novel", "psnr")) and (b := run.value("finetuned", "psnr"))]
+        gains = [
+            found - run.value("novel", "psnr") for run in of if (found := run.value("finetuned", "psnr")) is not None
+        ]
         gain = f"{statistics.fmean(gains):+.2f}" if gains else "-"
         rows.append([name, *(cell(of, kind, number) for number, kind in both), gain])
     for layout in ("planar", "unstructured"):

@@ -40,7 +40,8 @@ Place = tuple[int, int]  # (r, c)
 
 STEP = 4  # rows and columns from one known view of a planar grid to the next (Protocol)
 EVERY, FIRST = 8, 4  # in file order every 8th image is held out, beginning with index 4 (Protocol)
-FARTHEST = 1e30  # of any number in a pose: its fourth power is still finite
+FARTHEST = 1e30  # of a camera's centre along any axis: its square is still finite
+UNIT = 1.01  # of an entry of a camera's axes, which have the length 1
 POSE_ERROR = 1e-3  # of the distance between cameras, and radians: weights need not reproduce a pose more closely
 FEWEST = 9  # images that a folder must hold before any is held out
 ARCHIVES = {Layout.planar: "stanford", Layout.llff: "llff"}  # groups of conf/scene that have a public address
@@ -419,11 +420,11 @@ def _cameras(file: Path, count: int) -> np.ndarray:
     if len(poses) != count:
         raise SceneError(f"{file}: {len(poses)} rows for {count} images; expected a row for each: {remedy}")
     cameras = poses[:, :15].reshape(-1, 3, 5)[:, :, :4].astype(np.float64)
-    wrong = np.flatnonzero(~(np.abs(cameras) < FARTHEST).all(axis=(1, 2)))
+    wrong = np.flatnonzero(~(np.abs(cameras) < [UNIT, UNIT, UNIT, FARTHEST]).all(axis=(1, 2)))
     if len(wrong):
         raise SceneError(
             f"{file}: the camera of image {wrong[0]} has axes and centre {cameras[wrong[0]].tolist()}; "
-            f"expected numbers below {FARTHEST:g}: {remedy}"
+            f"expected axes of length 1 and a centre below {FARTHEST:g}: {remedy}"
         )
     return cameras
 
