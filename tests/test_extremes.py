@@ -34,7 +34,7 @@ import pytest
 import torch
 from conftest import WITH_TOWER, checkpoint_of, keep_config, pattern
 
-from viinter import config, image, metrics
+from viinter import config, image, memory, metrics
 from viinter.codes import lerp
 from viinter.config import RenderConfig, UserError
 from viinter.fields.fast import FastField
@@ -159,17 +159,13 @@ def test_two_hundred_views(run, model):
 
 def peak(work):
     """Megabytes that `work` takes at its height, over those taken before; Linux counts them."""
-    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    reset = Path("/proc/self/clear_refs")
     if not reset.exists():
         pytest.skip("peak memory is read from Linux's /proc")
-
-    def now(key):
-        return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith(key)) / 1024
-
-    reset.write_text("5")
-    before = now("VmRSS")
+    reset.write_text("5")  # the peak begins anew at what is taken now
+    before = memory.peak_mb()
     work()
-    return now("VmHWM") - before
+    return memory.peak_mb() - before
 
 
 @pytest.mark.parametrize("name", ["paper", "fast"])

@@ -6,6 +6,7 @@ Image files have such tests of their own in `test_image.py`, and one that is gui
 import contextlib
 import copy
 import io
+import resource
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ from viinter.module import read_checkpoint
 def test_mutated_pictures_are_read_or_refused(tmp_path):
     pytest.importorskip("atheris", reason="atheris has wheels for Linux on x86_64 and Python 3.11 to 3.13")
     (tmp_path / "seeds").mkdir()
-    found = typed("-m", "tests.fuzz_images", "seeds", "-runs=3000", "-seed=1", cwd=tmp_path)
+    started_at = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024  # what libFuzzer counts begins there
+    limit = f"-rss_limit_mb={started_at + 2048}"
+    found = typed("-m", "tests.fuzz_images", "seeds", "-runs=3000", "-seed=1", limit, cwd=tmp_path)
     assert found.returncode == 0, found.stderr
     assert "Done 3000 runs" in found.stderr
 

@@ -10,8 +10,6 @@ import itertools
 import json
 import logging
 import math
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -26,7 +24,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 
-from viinter import command, config, metrics, page, scenes, twin
+from viinter import command, config, memory, metrics, page, scenes, twin
 from viinter.callbacks import Budget
 from viinter.config import ConfigError, TrainConfig
 from viinter.guard import DivergenceError
@@ -343,8 +341,7 @@ class Odometer(L.Callback):
         seconds = self.clock.seconds
         self.rows.append({
             "step": step, "training_seconds": seconds, "stopwatch_seconds": time.perf_counter() - self.begin,
-            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "linux"
-                                                                                   else 1024**2),
+            "peak_memory_mb": memory.peak_mb(),
             "norm_error": (norms / radius - 1).abs().max().item(),
             "rate_error": abs(trainer.optimizers[0].param_groups[0]["lr"] / rate - 1),
         })  # fmt: skip

@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import platform
-import resource
 import sys
 import timeit
 import warnings
@@ -27,7 +26,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from viinter import command, config, features, image, pictures, scenes
+from viinter import command, config, features, image, memory, pictures, scenes
 from viinter.callbacks import (
     Budget,
     Clock,
@@ -260,10 +259,9 @@ def omitted(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, steps: int
 
 def facts(cfg: TrainConfig, scene: Scene, module: ViewInterpolator, trainer: L.Trainer, clock: Clock) -> dict[str, Any]:
     """What `metrics.json` says of the run beside the errors: time, memory, what was left out, versions."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
     found = {
         "training_seconds": clock.seconds, "wall_seconds": clock.wall_seconds, "steps": trainer.global_step,
-        "peak_memory_mb": peak, "codes_redrawn": int(module.codes.redrawn),
+        "peak_memory_mb": memory.peak_mb(), "codes_redrawn": int(module.codes.redrawn),
         "code_length": module.codes.weight.detach().norm(dim=1).mean().item(), "probes_left_out": scene.left_out,
         "omitted": omitted(cfg, scene, module, trainer.global_step), "scene": scene.name, "model": cfg.model.name,
         "seed": cfg.seed, "threads": torch.get_num_threads(), "device": str(module.device),
