@@ -18,8 +18,8 @@ M = 8
 
 def make(height: int = 64, width: int = 64, views: int = 2, **changes) -> FastField:
     torch.manual_seed(0)
-    settings = {"layers": 3, "sets": 2, "motion": 6, "margin": 1.1, "sharpness": 5.0, "entropy": 1e-3, "smooth": 0.0,
-                "consistency": 1.0, "remainder": True} | changes  # fmt: skip
+    settings = {"layers": 3, "sets": 2, "motion": 6, "margin": 1.1, "texture_pixels": 2**18, "sharpness": 5.0,
+                "entropy": 1e-3, "smooth": 0.0, "consistency": 1.0, "remainder": True} | changes  # fmt: skip
     return FastField(M, views, height, width, **settings)
 
 
@@ -82,11 +82,14 @@ def test_looking_up_between_pixels_is_bilinear_and_ends_at_the_border(height, wi
             assert torch.allclose(colours, expected[0, :, 0].T, atol=1e-5)
 
 
-@pytest.mark.parametrize("progress", [0.0, 0.2, 1.0])  # at 32, 64 and 128 pixels
-def test_known_views_agree_where_the_motion_is_right_and_disagree_where_it_is_not(progress, monkeypatch):
-    """Two views of a smooth picture that slides by 8 pixels."""
+@pytest.mark.parametrize(("progress", "texture_pixels"), [(0.0, 128**2), (0.2, 128**2), (1.0, 128**2), (1.0, 64**2)])
+def test_known_views_agree_where_the_motion_is_right_and_disagree_where_it_is_not(
+    progress, texture_pixels, monkeypatch
+):
+    """Two views of a smooth picture that slides by 8 pixels, at 32, 64, 128 and 64 of their 128 pixels."""
     monkeypatch.setattr(fast, "FEW", 1)  # textures are still empty
-    field, codes = make(128, 128), torch.nn.Parameter(torch.stack([torch.zeros(M), torch.eye(M)[0]]))
+    field = make(128, 128, texture_pixels=texture_pixels)
+    codes = torch.nn.Parameter(torch.stack([torch.zeros(M), torch.eye(M)[0]]))
     wide = torch.sin(torch.arange(136) / 20)[:, None, None].expand(-1, 128, 3).transpose(0, 1) / 2 + 0.5
     views = torch.stack([wide[:, :128], wide[:, 8:]])  # a thing at x in the first is at x - 8 in the second
     field.see(views)
@@ -168,6 +171,15 @@ def test_the_coarsest_level_has_about_32_pixels_and_the_finest_those_of_a_view(h
     assert len(field.colours) == levels
     assert field.colours[-1].shape[-2:] == (max(2, round(1.1 * height)), max(2, round(1.1 * width)))
     assert torch.isfinite(draw(field, torch.randn(M), height, width)).all()
+
+
+@pytest.mark.parametrize(("texture_pixels", "share"), [(200 * 300, 1), (200 * 300 - 1, 2), (4000, 4), (1, 8)])
+def test_larger_views_have_smaller_textures_down_to_the_coarsest(texture_pixels, share):
+    whole, field = make(200, 300), make(200, 300, texture_pixels=texture_pixels)
+    assert field.colours[-1].shape[-2:] == (round(220 / share), round(330 / share))
+    assert field.colours[0].shape == whole.colours[0].shape
+    assert field.rates() == [r if r == 1 else r * share for r in whole.rates()]
+    assert torch.isfinite(draw(field, torch.randn(M), 200, 300)).all()
 
 
 @pytest.mark.parametrize("size", [32, 64, 128, 256, 1024])
@@ -376,7 +388,8 @@ def decibel(image: torch.Tensor, target: torch.Tensor) -> float:
     return -10 * (image.clamp(0, 1) - target).square().mean().log10().item()
 
 
-def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross_faded():
+@pytest.mark.parametrize("texture_pixels", [64**2, 32**2])
+def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross_faded(texture_pixels):
     """Five views of a texture that moves 4 pixels from each to the next; the views half way between were never seen."""
     wide = blobs(144, 192, 0)
 
@@ -386,7 +399,7 @@ def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross
         return torch.nn.functional.avg_pool2d(wider, 2).permute(1, 2, 0)
 
     codes, views = random_codes(5), torch.stack([view(k) for k in range(5)])
-    field = make(64, 64, views=5, layers=2)
+    field = make(64, 64, views=5, layers=2, texture_pixels=texture_pixels)
     fit(field, views, codes)
     for k in range(4):
         drawn = draw(field, lerp(codes[k], codes[k + 1], 0.5).detach(), 64, 64)

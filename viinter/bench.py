@@ -29,6 +29,7 @@ from viinter import command, config, peers, races, scenes
 from viinter.config import ConfigError, Layout, TrainConfig
 from viinter.data import PixelStore
 from viinter.evidence import TARGETS, seconds_to
+from viinter.fields.fast import reductions
 from viinter.module import ViewInterpolator
 from viinter.train import train, write_json
 
@@ -236,18 +237,19 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     where = [f"scene.root={cfg.scene.root}", f"scene.downsample={cfg.scene.downsample}"]
     asked = [*typed(), *where, "evaluation.first_seconds=1"]
     found = {}
-    for name, own in races.methods(cfg.optim.training_seconds).items():
+    for name, own in races.methods(cfg.optim.training_seconds, cfg.scene.layout).items():
         Console().rule(name)
         found[name] = races.train(folder / re.sub(r"\W+", "_", name), own, asked)
+    probed = [kind for kind in ("novel", "novel_posed") if scene.probes.get(kind)]
     rows = [
         [name, f"{r.metrics['steps']}", f"{r.metrics['training_seconds']:.1f}", f"{r.value('known', 'psnr'):.2f}",
-         f"{r.value('novel', 'psnr'):.2f}", *(reached(seconds_to(r, target)) for target in TARGETS)]
+         *(f"{r.value(kind, 'psnr'):.2f}" for kind in probed), *(reached(seconds_to(r, target)) for target in TARGETS)]
         for name, r in found.items()
     ]  # fmt: skip
     untrained = {k: f["psnr"] for k, f in peers.measure(scene).items() if not isinstance(f, str)}
-    rows += [[f"{name}, no training", "", "", "", f"{psnr:.2f}", *("" for _ in TARGETS)]
+    rows += [[f"{name}, no training", "", "", "", f"{psnr:.2f}", *("" for _ in [*probed[1:], *TARGETS])]
              for name, psnr in untrained.items()]  # fmt: skip
-    columns = ["", "steps", "training s", "known", "novel", *(f"s to {target} dB" for target in TARGETS)]
+    columns = ["", "steps", "training s", "known", *probed, *(f"s to {target} dB" for target in TARGETS)]
     threads = cfg.threads or torch.get_num_threads()
     shown(f"{scene.name}, {scene.width} x {scene.height}, {threads} threads", columns, rows)
     for name, r in found.items():
@@ -291,7 +293,8 @@ def scaling(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
         shown(f"by {what}", [what, f"s to {SCALING_TARGET} dB", "ms a step", "peak MB"], rows)
         result[what] = {"measured": measured, "exponents": powers}
     layers, pixels = run.setting("model.layers") * run.setting("model.sets"), run.setting("optim.batch_pixels")
-    result["a step"] = races.step_work(whole.height, whole.width, layers, pixels)
+    *_, by = reductions(whole.height, whole.width, run.setting("model.texture_pixels"))
+    result["a step"] = races.step_work(whole.height / by, whole.width / by, layers, pixels)
     shown(f"One step, {layers} layers, {pixels} pixels", ["", *result["a step"]],
           [["model=fast", *(f"{value:.3g}" for value in result["a step"].values())]])  # fmt: skip
     write_json(folder / "bench.json", result)

@@ -148,6 +148,9 @@ class FastModel(ModelConfig):
     sets: int = setting(4, "sets of layers, each right by itself, fewer in short budgets; their mean is drawn")
     motion: int = setting(6, "motion polynomials: 1 shifts, 3 adds turns and zooms, 6 adds perspective")
     margin: float = setting(1.1, "size of a texture in views, for what moves in from outside")
+    texture_pixels: int = setting(
+        2**18, "textures have the size of a view up to this; of larger views half of it, or a quarter, and so on"
+    )
     sharpness: float = setting(5.0, "scale of the layers' weights in their softmax")
     entropy: float = setting(1e-3, "weight of the penalty on pixels that mix layers")
     smooth: float = setting(2e-3, "weight of the penalty on disparities that differ between pixels of one colour")
@@ -333,7 +336,8 @@ def check(cfg: TrainConfig) -> None:
         "evaluation.chunk_pixels": cfg.evaluation.chunk_pixels, "logging.every_seconds": cfg.logging.every_seconds,
         "checkpoint.every_seconds": cfg.checkpoint.every_seconds,
     }  # fmt: skip
-    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "sets", "margin", "sharpness"):
+    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "sets", "margin", "texture_pixels",
+                "sharpness"):  # fmt: skip
         if hasattr(cfg.model, key):
             positive[f"model.{key}"] = getattr(cfg.model, key)
     for key, value in positive.items():

@@ -73,8 +73,8 @@ class FastField(Field):
     """
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
-                 margin: float, sharpness: float, entropy: float, smooth: float, consistency: float,
-                 remainder: bool) -> None:  # fmt: skip
+                 margin: float, texture_pixels: int, sharpness: float, entropy: float, smooth: float,
+                 consistency: float, remainder: bool) -> None:  # fmt: skip
         super().__init__()
         self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
         self.drawn: tuple[Tensor, ...] = ()
@@ -85,8 +85,9 @@ class FastField(Field):
         self.pitch = 2 / width
         self.shape, self.active = (sets, layers), sets
         layers *= sets  # those of a set one after the other
-        count = max(0, math.ceil(math.log2(min(height, width) / COARSEST))) + 1
-        sizes = [(round(height * margin / 2**k), round(width * margin / 2**k)) for k in reversed(range(count))]
+        self.reductions = reductions(height, width, texture_pixels)
+        sizes = [(round(height * margin / by), round(width * margin / by)) for by in self.reductions]
+        count = len(sizes)
         self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
         halves = [(max(4, h // 2), max(4, w // 2)) for h, w in sizes]
         self.weights = nn.ParameterList(torch.zeros(layers, 1, *half) for half in halves[: max(1, count - 1)])
@@ -288,7 +289,7 @@ class FastField(Field):
             near = distances.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
         partner = near[view, self.step // COMPARED % near.shape[1]]
         there, inside = self.found(partner, places, xy, phi, place, seen)
-        own = rgb if self._reduction() == 1 else look_up(self._maps(), view, self._pixel(xy))
+        own = rgb if self.reductions[self.level] == 1 else look_up(self._maps(), view, self._pixel(xy))
         apart = (robust((there - own).square().mean(-1)) * inside).mean()
         return apart + self.between(view, partner, xy, phi, places) if len(codes) <= FEW else apart
 
@@ -320,18 +321,14 @@ class FastField(Field):
     def _pixel(self, xy: Tensor) -> Tensor:
         """Where `xy` [..., 2, P] lies in the known views at the size of the level, counted in their pixels."""
         _, height, width, _ = self.known.shape
-        return ((xy + 1) * xy.new_tensor([[width], [height]]) / 2 + 0.5) / self._reduction() - 0.5
-
-    def _reduction(self) -> int:
-        """How many times smaller than the known views those of the level in training are."""
-        return 2 ** (len(self.colours) - 1 - self.level)
+        return ((xy + 1) * xy.new_tensor([[width], [height]]) / 2 + 0.5) / self.reductions[self.level] - 0.5
 
     def _maps(self) -> Tensor:
         """The known views [n, h, w, 3] at the size of the level in training."""
         return self._kept("known", [self.known], self._reduced)
 
     def _reduced(self) -> Tensor:
-        by, maps = self._reduction(), self.known.to(self.shift.dtype)
+        by, maps = self.reductions[self.level], self.known.to(self.shift.dtype)
         return F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
 
     def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
@@ -442,6 +439,13 @@ class FastField(Field):
             own = sample(self.remainder[view].to(at.dtype), at[:, None])[:, :, 0]
             total.addcmul_(share[:, None, None], own)
         return total.movedim(1, -1)
+
+
+def reductions(height: int, width: int, texture_pixels: int) -> list[int]:
+    """How many times smaller than a view the textures of each level are: powers of 2, from that which brings a view's
+    shorter side to about `COARSEST` pixels to the least that brings the view to `texture_pixels` at most."""
+    most = max(0, math.ceil(math.log2(min(height, width) / COARSEST)))
+    return [2**k for k in range(most, -1, -1) if k == most or height * width <= texture_pixels * 4**k]
 
 
 def pyramid(levels: list[Tensor]) -> Tensor:
