@@ -1,8 +1,8 @@
 """The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
 
 Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `K` motion polynomials,
-`S` active sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view, weights
-and disparities. Under the code z the pixel xy reads layer l at
+`S` active sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view (half of a
+large one's, or a quarter), weights and disparities. Under the code z the pixel xy reads layer l at
 
     u_l = xy + a(xy, z) + d_l(u) b(xy, z) + e_l(u) c(z),    a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
 
