@@ -120,7 +120,7 @@ def test_between_two_views_a_colour_of_either_is_right_and_no_other():
     torch.nn.init.zeros_(field.shift)
     xy = pixel_grid(64, 64).T[None]
     phi, places = field.basis(xy), field.place(codes)
-    field.step = 1
+    field.step.fill_(1)
 
     def between(*colours: float) -> torch.Tensor:
         field.see(torch.tensor(colours).view(2, 1, 1, 1).expand(2, 64, 64, 3))

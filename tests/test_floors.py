@@ -7,8 +7,8 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "viinter"
 FLOORS = [
-    ["config", "files", "image", "video", "codes", "features", "memory", "metrics", "fields.field",
-     "fields.paper", "fields.fast"],
+    ["config", "files", "image", "video", "codes", "features", "memory", "metrics", "replay",
+     "fields.field", "fields.paper", "fields.fast"],
     ["scenes"],
     ["data", "module", "views", "peers"],
     ["callbacks", "checkpoints", "guard", "pictures", "step_times", "page", "runs", "comparisons", "evidence", "plots",

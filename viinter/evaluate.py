@@ -13,7 +13,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 from torch import Tensor, nn
 
 from viinter import command, config, metrics, scenes
@@ -24,6 +24,8 @@ from viinter.module import ViewInterpolator, load, run_device
 from viinter.scenes import Probe
 from viinter.train import about, describe, write_json
 from viinter.views import draw, measure
+
+TOGETHER = 32_768  # pixels in a step of finetuning, of all probes
 
 ABOUT = """
 Measures the known views and probes of a finished run: PSNR, SSIM, MSE, for every image and on average; then the probes
@@ -59,9 +61,8 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
             lambda kind, k, *_: status.update(f"measuring {kind} {k + 1}"),
         )  # fmt: skip
     if cfg.finetune_steps and scene.probes["novel"]:
-        errors = {}
-        for probe in track(scene.probes["novel"], "finetuning codes", console=console):
-            z = finetune(model.field, codes, probe, cfg)
+        errors, probes = {}, scene.probes["novel"]
+        for probe, z in zip(probes, finetune(model.field, codes, probes, cfg, console), strict=True):
             with as_trained(model, trained):
                 image = draw(model.field, z, scene.height, scene.width, cfg.chunk_pixels)
             errors[probe.name] = metrics.compare(image, probe.target.to(image.device))
@@ -82,24 +83,36 @@ def as_trained(model: ViewInterpolator, trained: TrainConfig) -> torch.autocast:
     return torch.autocast(model.device.type, kind, enabled="16" in name and model.dtype == torch.float32)
 
 
-def finetune(field: nn.Module, codes: Tensor, probe: Probe, cfg: EvaluateConfig) -> Tensor:
-    """The code [M] that shows `probe.target` best, found by Adam from the probe's mix; `field` is not touched.
+def finetune(
+    field: nn.Module, codes: Tensor, probes: list[Probe], cfg: EvaluateConfig, console: Console
+) -> Tensor:
+    """The codes [n, M] that show the targets of n probes best, found by Adam from their mixes; `field` is not touched.
 
-    The code is not held on the sphere: a mix lies inside it. Its step is measured against the code book's own scale,
-    which the norm's order changes by orders of magnitude, and falls to zero along a cosine.
+    A code is not held on the sphere: a mix lies inside it. Its step is measured against the code book's own scale,
+    which the norm's order changes by orders of magnitude, and falls to zero along a cosine. Several probes take their
+    steps side by side, as many as `TOGETHER` allows; none knows of the others.
     """
-    z = mix(codes, probe.mix)
-    z = z.to(torch.promote_types(z.dtype, torch.float32)).requires_grad_()  # steps are finer than 16 bits
-    store = PixelStore(probe.target[None], cfg.finetune_pixels, config.PixelsFrom.one_view, 0, codes.device)
+    found = []
     first = cfg.finetune_lr * codes.square().mean().sqrt().item()
-    optimizer = torch.optim.Adam([z], lr=first)
-    for step in range(cfg.finetune_steps):
-        optimizer.param_groups[0]["lr"] = first * (1 + math.cos(math.pi * step / cfg.finetune_steps)) / 2
-        batch = store.batch(step)
-        loss = F.mse_loss(field(batch.xy, z[None]), batch.rgb)
-        (z.grad,) = torch.autograd.grad(loss, [z])
-        optimizer.step()
-    return z.detach()
+    many = max(1, TOGETHER // cfg.finetune_pixels)
+    groups = [probes[k : k + many] for k in range(0, len(probes), many)]
+    with Progress(console=console) as progress:
+        task = progress.add_task("finetuning codes", total=len(groups) * cfg.finetune_steps)
+        for group in groups:
+            z = torch.stack([mix(codes, probe.mix) for probe in group])
+            z = z.to(torch.promote_types(z.dtype, torch.float32)).requires_grad_()  # steps are finer than 16 bits
+            targets, pixels = torch.stack([probe.target for probe in group]), len(group) * cfg.finetune_pixels
+            store = PixelStore(targets, pixels, config.PixelsFrom.all_views, 0, codes.device)
+            optimizer = torch.optim.Adam([z], lr=first)
+            for step in range(cfg.finetune_steps):
+                optimizer.param_groups[0]["lr"] = first * (1 + math.cos(math.pi * step / cfg.finetune_steps)) / 2
+                batch = store.batch(step)
+                loss = len(group) * F.mse_loss(field(batch.xy, z), batch.rgb)  # the sum of their errors
+                (z.grad,) = torch.autograd.grad(loss, [z])
+                optimizer.step()
+                progress.advance(task)
+            found.append(z.detach())
+    return torch.cat(found)
 
 
 if __name__ == "__main__":

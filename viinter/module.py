@@ -21,6 +21,7 @@ from viinter.data import PixelBatch
 from viinter.fields.fast import FastField
 from viinter.fields.field import Field
 from viinter.fields.paper import PaperField
+from viinter.replay import ReplayedLoss
 
 
 def make_field(cfg: ModelConfig, n: int, height: int, width: int) -> Field:
@@ -50,15 +51,31 @@ class ViewInterpolator(L.LightningModule):
         self.codes = CodeBook(n, cfg.model.code_dim, norm_order(cfg.codes.p), cfg.codes.radius, cfg.codes.length)
         self.codes.project_()
         self.field.calibrate(self.codes.weight)
+        self.replayed: tuple[Any, ReplayedLoss | None] = None, None
 
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
         """Colours [V, P, 3] of `xy` [V, P, 2] under codes `z` [V, M]."""
         return self.field(xy, z)
 
+    def on_train_start(self) -> None:
+        """Lightning moves the weights between one `fit` and the next, and a graph would go on with the old ones."""
+        self.replayed = None, None
+
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
+        """The loss of a batch; on a GPU by replaying a CUDA graph, if nothing takes part that cannot be captured."""
+        if not batch.xy.is_cuda or torch.is_autocast_enabled("cuda") or torch.distributed.is_initialized():
+            return self.loss(*batch)
+        key = (self.field.stage(), *(part.shape for part in batch))
+        if self.replayed[0] != key:
+            self.replayed = None, None  # gives its memory back first
+            self.replayed = key, ReplayedLoss(self.loss, list(self.parameters()), batch)
+        return self.replayed[1](*batch)
+
+    def loss(self, view: Tensor, xy: Tensor, rgb: Tensor) -> Tensor:
+        """The mean squared error of the pixels of a `PixelBatch`, and the field's penalty."""
         codes = self.codes.weight
-        error = F.mse_loss(self.field(batch.xy, codes[batch.view]), batch.rgb)
-        return error + self.field.penalty(batch.view, batch.rgb, codes)
+        error = F.mse_loss(self.field(xy, codes.index_select(0, view)), rgb)
+        return error + self.field.penalty(view, rgb, codes)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam over field and codes (supplement); the rate is set before each step by `callbacks.Budget`."""

@@ -140,7 +140,7 @@ def train(
         trainer.fit(module, data, ckpt_path=start, weights_only=True)
         if not first:
             return {}
-        module.eval()
+        module.to(trainer.strategy.root_device).eval()  # Lightning leaves it on the CPU
         metrics = {**errors.final, "measured_every": errors.every, **facts(cfg, scene, module, trainer, clock)}
         metrics |= {"seconds": times.seconds(), "restarts": len(guard.restarts), "restarted": guard.restarts}
         write_json(run_dir / "metrics.json", metrics)

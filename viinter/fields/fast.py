@@ -59,7 +59,7 @@ COMPARED = 4  # one of so many rows of a batch is looked up in another known vie
 PARTNERS = 4  # which is one of so many nearest in motion, in turns
 OCCLUDED = 0.05  # rgb: differences well above this count little, they may be another surface
 FEW = 4  # known views at most, if mixes of their codes are held to them too
-GOLDEN = 0.6180339887  # multiples of it, less their whole part, spread evenly over [0, 1] (Weyl 1916)
+GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole parts, spread evenly (Weyl 1916)
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 
 
@@ -79,6 +79,7 @@ class FastField(Field):
         self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
         self.drawn: tuple[Tensor, ...] = ()
         self.known: Tensor | None = None
+        self.maps: Tensor | None = None
         self.kept: dict[str, tuple[list, Tensor]] = {}
         self.margin, self.sharpness, self.motion = margin, sharpness, motion
         self.entropy, self.smooth, self.consistency = entropy, smooth, consistency
@@ -105,11 +106,15 @@ class FastField(Field):
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.register_buffer("decided", torch.zeros((), dtype=torch.long))  # how many sets are left, if so
         self.register_load_state_dict_post_hook(FastField._loaded)
-        self.level, self.step, self.decision = count - 1, 0, 1.0
+        self.level = count - 1
+        # what changes from step to step is on the device, where a CUDA graph can read it, and so is what is constant
+        self.register_buffer("step", torch.zeros((), dtype=torch.long), persistent=False)
+        self.register_buffer("decision", torch.ones(()), persistent=False)
+        self.register_buffer("size", torch.tensor([[width], [height]]).float(), persistent=False)
 
     def see(self, views: Tensor) -> None:
         """Holds the known views [n, H, W, 3] that `penalty` compares, and no copy of them, until `finish`."""
-        self.known = views if len(views) > 1 and self.consistency else None
+        self.known, self.maps = views if len(views) > 1 and self.consistency else None, None
 
     def calibrate(self, codes: Tensor) -> None:
         """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
@@ -146,8 +151,13 @@ class FastField(Field):
         level = next((k for k, (end, last) in enumerate(stages) if progress < end and step < last), count - 1)
         if level != self.level:
             self.kept.clear()
-        self.level, self.step = level, step
-        self.decision = min(max((progress - 0.3) / 0.3, 0.0), 1.0)
+            self.maps = None
+        self.level = level
+        self.step.fill_(step)
+        self.decision.fill_(min(max((progress - 0.3) / 0.3, 0.0), 1.0))
+
+    def stage(self) -> int:
+        return self.level
 
     @staticmethod
     def _loaded(field: FastField, _: Any) -> None:
@@ -184,8 +194,11 @@ class FastField(Field):
     def _kept(self, name: str, of: list[Tensor], make: Callable[[], Tensor]) -> Tensor:
         """What `make()` gave the last time, if the tensors `of` that it is made of are the same since.
 
-        A fused optimiser changes weights without counting it in their `_version`: see `at` and `train`.
+        A fused optimiser changes weights without counting it in their `_version`: see `at` and `train`. In a CUDA
+        graph it is made each time: the graph would not know of another.
         """
+        if of[0].is_cuda and torch.cuda.is_current_stream_capturing():
+            return make()
         now = [(t.data_ptr(), t._version, t.dtype) for t in of]
         was, found = self.kept.get(name, (None, None))
         if was != now:
@@ -280,14 +293,15 @@ class FastField(Field):
         Each view is compared with one of those nearest to it in motion, with another at each step, and at the size of
         the level in training. Of few known views, a mix with that one is drawn too and held to both.
         """
-        some = slice(self.step % COMPARED, None, COMPARED) if len(view) >= COMPARED else slice(None)
         xy, phi, place, seen = self.drawn
-        view, rgb, xy, phi, place, seen = view[some], rgb[some], xy[some], phi[some], place[some], seen[:, :, some]
-        places = self.place(codes)
+        some = torch.arange(max(len(view) // COMPARED, 1), device=xy.device) * COMPARED + self.step % COMPARED
+        some %= len(view)
+        view, rgb, xy, phi, place = (part.index_select(0, some) for part in (view, rgb, xy, phi, place))
+        seen, places = seen.index_select(2, some), self.place(codes)
         with torch.no_grad():
             distances = torch.cdist(places.flatten(1), places.flatten(1)).fill_diagonal_(math.inf)
             near = distances.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
-        partner = near[view, self.step // COMPARED % near.shape[1]]
+        partner = near[view, (self.step // COMPARED % near.shape[1])[None]]
         there, inside = self.found(partner, places, xy, phi, place, seen)
         own = rgb if self.reductions[self.level] == 1 else look_up(self._maps(), view, self._pixel(xy))
         apart = (robust((there - own).square().mean(-1)) * inside).mean()
@@ -297,7 +311,8 @@ class FastField(Field):
         """How far what each set shows at `xy` [V, 2, P] of a view between the known views number `view` and `partner`
         [V], at `places` [n, S, 4 K + 2], is from what the better of these two has where the motion takes it: what one
         of them does not see the other mostly does (as in Godard et al. 2019)."""
-        place = torch.lerp(places[view], places[partner], self.step * GOLDEN % 1)
+        share = (self.step * GOLDEN % 65_536 / 65_536).to(places.dtype)
+        place = torch.lerp(places.index_select(0, view), places.index_select(0, partner), share)
         each, _, seen = self.each_set(xy, phi, place)
         each, errors = each.movedim(1, -1) + 0.5, []
         for known in (view, partner):
@@ -311,25 +326,24 @@ class FastField(Field):
         """Colours [S, V, P, 3] that the known views number `known` [V] of those at `places` [n, S, 4 K + 2] have where
         the motion takes the pixels `xy` [V, 2, P] of views at `place` [V, S, 4 K + 2] with what is `seen` [S, 2, V, P]
         there; and whether that is inside the view [S, V, P]."""
-        a, b, c = self.carry(phi, place - places[known])
+        a, b, c = self.carry(phi, place - places.index_select(0, known))
         disparity, drift = seen[..., None, :].unbind(1)
         moved = self.margin * torch.addcmul(torch.addcmul(a, disparity, b), drift, c)  # [S, V, 2, P]
         maps, there = self._maps(), self._pixel(xy + moved)
-        last = there.new_tensor([[maps.shape[2] - 1], [maps.shape[1] - 1]])
-        return look_up(maps, known, there), ((there >= 0) & (there <= last)).all(2)
+        x, y = there.unbind(2)
+        inside = (x >= 0) & (x <= maps.shape[2] - 1) & (y >= 0) & (y <= maps.shape[1] - 1)
+        return look_up(maps, known, there), inside
 
     def _pixel(self, xy: Tensor) -> Tensor:
         """Where `xy` [..., 2, P] lies in the known views at the size of the level, counted in their pixels."""
-        _, height, width, _ = self.known.shape
-        return ((xy + 1) * xy.new_tensor([[width], [height]]) / 2 + 0.5) / self.reductions[self.level] - 0.5
+        return ((xy + 1) * self.size / 2 + 0.5) / self.reductions[self.level] - 0.5
 
     def _maps(self) -> Tensor:
-        """The known views [n, h, w, 3] at the size of the level in training."""
-        return self._kept("known", [self.known], self._reduced)
-
-    def _reduced(self) -> Tensor:
-        by, maps = self.reductions[self.level], self.known.to(self.shift.dtype)
-        return F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
+        """The known views [n, h, w, 3] at the size of the level in training, the same memory until that changes."""
+        if self.maps is None:
+            by, maps = self.reductions[self.level], self.known.to(self.shift.dtype)
+            self.maps = F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
+        return self.maps
 
     def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
         """Four terms on the pixels of the last call.
@@ -391,7 +405,7 @@ class FastField(Field):
                 for rows in (slice(k, k + many) for k in range(0, height, many)):
                     own[:, rows] = view[:, rows] - self.mean(shown(z, rows))
         self.finished.fill_(True)
-        self.known = None  # nothing is compared any more, and whoever keeps the field need not keep them
+        self.known = self.maps = None  # nothing is compared any more, and whoever keeps the field need not keep them
         self.train(was)
 
     def mean(self, each: Tensor) -> Tensor:
@@ -429,9 +443,7 @@ class FastField(Field):
         weights = torch.cat([a.sum(2), b.flatten(2, 3), c], 2).transpose(2, 3)
         disparity, drift = seen.movedim(2, 0).unbind(2)
         scaled = (disparity[:, :, None] * phi[:, None]).flatten(1, 2)
-        _, _, height, width = self.remainder.shape
-        size = xy.new_tensor([[width], [height]])
-        scale = size / (size - 1).clamp_min(1)  # pixel centres at both ends, as grid_sample counts
+        scale = self.size / (self.size - 1).clamp_min(1)  # pixel centres at both ends, as grid_sample counts
         motion = (scale * weights).flatten(1, 2) @ torch.cat([phi, scaled, drift], 1)
         there = ((xy + 1) * scale - 1)[:, None] + motion.unflatten(1, (-1, 2))  # [V, N, 2, P]
         total = xy.new_zeros(len(xy), 3, xy.shape[-1])
