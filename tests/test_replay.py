@@ -7,6 +7,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from viinter import module as modules
 from viinter.config import TrainConfig
 from viinter.data import PixelBatch
+from viinter.fields.field import Field
 from viinter.module import ViewInterpolator
 from viinter.replay import ReplayedLoss
 from viinter.train import train
@@ -62,6 +63,7 @@ def test_stages_follow_the_levels(make_config):
         stages.append(model.field.stage())
     assert stages == [0, 0, 1]
     assert modules.make_field(make_config().model, 2, 8, 8).stage() == 0
+    assert Field().stage() is None
 
 
 @gpu

@@ -62,10 +62,11 @@ class ViewInterpolator(L.LightningModule):
         self.replayed = None, None
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
-        """The loss of a batch; on a GPU by replaying a CUDA graph, if nothing takes part that cannot be captured."""
-        if not batch.xy.is_cuda or torch.is_autocast_enabled("cuda") or torch.distributed.is_initialized():
+        """The loss of a batch; on one GPU, without mixed precision, a CUDA graph's if the field allows it."""
+        stage = self.field.stage() if batch.xy.is_cuda else None
+        if stage is None or torch.is_autocast_enabled("cuda") or torch.distributed.is_initialized():
             return self.loss(*batch)
-        key = (self.field.stage(), *(part.shape for part in batch))
+        key = (stage, *(part.shape for part in batch))
         if self.replayed[0] != key:
             self.replayed = None, None  # gives its memory back first
             self.replayed = key, ReplayedLoss(self.loss, list(self.parameters()), batch)

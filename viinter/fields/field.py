@@ -28,10 +28,11 @@ class Field(nn.Module):
     def at(self, progress: float, step: int = 0) -> None:
         """Called before each step with the share of the budget that is used, in [0, 1], and the steps taken."""
 
-    def stage(self) -> int:
-        """A number that changes whenever `at` has changed which operations a training step consists of; whatever else
-        changes from step to step is in buffers on the device."""
-        return 0
+    def stage(self) -> int | None:
+        """A number that changes whenever `at` has changed which operations a training step consists of. Whatever else
+        changes from step to step must then be in buffers: on a GPU a step is captured once for each stage (`replay`).
+        None, for a field that does not keep to this: its steps are not captured."""
+        return None
 
     def rates(self) -> list[float]:
         """A factor on the learning rate of each of `parameter_groups`, after `at`."""

@@ -79,3 +79,6 @@ class PaperField(Field):
         for sine in self.hidden:
             x = sine(x)
         return self.rgb(x)
+
+    def stage(self) -> int:
+        return 0
