@@ -14,18 +14,19 @@ from viinter.train import train
 from viinter.twin import relative
 
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-VIEWS, SIDE = 5, 64
+SIDE = 64
+FIELDS = pytest.mark.parametrize(("name", "views"), [("fast", 5), ("fast", 3), ("paper", 5)])  # 3: mixes are held too
 
 
-def model_and_batches(cfg: TrainConfig, device: str) -> tuple[ViewInterpolator, list[PixelBatch]]:
+def model_and_batches(cfg: TrainConfig, device: str, views: int = 5) -> tuple[ViewInterpolator, list[PixelBatch]]:
     torch.manual_seed(0)
-    model = ViewInterpolator(cfg, VIEWS, {"height": SIDE, "width": SIDE}).to(device)
+    model = ViewInterpolator(cfg, views, {"height": SIDE, "width": SIDE}).to(device)
     batches = []
     for _ in range(2):
         y, x = torch.meshgrid(torch.rand(12) * 2 - 1, torch.arange(SIDE) * 2 / SIDE - 1, indexing="ij")
-        batch = torch.randint(VIEWS, (12,)), torch.stack([x, y], -1), torch.rand(12, SIDE, 3)
+        batch = torch.randint(views, (12,)), torch.stack([x, y], -1), torch.rand(12, SIDE, 3)
         batches.append(PixelBatch(*(part.to(device) for part in batch)))
-    model.field.see(torch.rand(VIEWS, SIDE, SIDE, 3, device=device))
+    model.field.see(torch.rand(views, SIDE, SIDE, 3, device=device))
     return model, batches
 
 
@@ -40,10 +41,10 @@ def change(model: ViewInterpolator) -> None:
             p += 0.01 * torch.randn_like(p)
 
 
-@pytest.mark.parametrize("name", ["fast", "paper"])
-def test_within_a_stage_a_step_does_not_depend_on_what_python_decides(make_config, name):
+@FIELDS
+def test_within_a_stage_a_step_does_not_depend_on_what_python_decides(make_config, name, views):
     """A trace, like a CUDA graph, holds the operations of one step; it must be right for others of the same stage."""
-    model, (first, second) = model_and_batches(make_config(model=name), "cpu")
+    model, (first, second) = model_and_batches(make_config(model=name), "cpu", views)
     model.field.at(0.4, 401)
     stage = model.field.stage()
     change(model)
@@ -67,10 +68,10 @@ def test_stages_follow_the_levels(make_config):
 
 
 @gpu
-@pytest.mark.parametrize("name", ["fast", "paper"])
+@FIELDS
 @pytest.mark.parametrize("progress", [0.1, 0.6])
-def test_a_replayed_loss_is_the_loss(make_config, name, progress):
-    model, (first, second) = model_and_batches(make_config(model=name), "cuda")
+def test_a_replayed_loss_is_the_loss(make_config, name, views, progress):
+    model, (first, second) = model_and_batches(make_config(model=name), "cuda", views)
     model.field.at(progress, 401)
     replayed = ReplayedLoss(model.loss, list(model.parameters()), first)
     for step in range(402, 408):
