@@ -29,6 +29,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITOR
 """of commands that tests type"""
 
 torch.set_num_threads(1)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite that a shell started with & would ignore it
 
 
 def pattern(right: float, down: float = 0.0, side: int = 32) -> torch.Tensor:
