@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from viinter.codes import lerp
 from viinter.fields import fast
-from viinter.fields.fast import FastField, look_up
+from viinter.fields.fast import FastField, best_shares, look_up
 from viinter.views import draw, pixel_grid
 
 M = 8
@@ -256,15 +256,38 @@ def test_without_a_remainder_only_the_time_to_judge_the_sets_is_kept_back_from_t
     assert make(remainder=False).settle(1000.0, 2, 0.25, lambda: 0.1) == pytest.approx(2 * 0.1 / 8)
 
 
-def test_each_set_counts_by_the_inverse_of_its_error_at_the_known_views():
+def test_sets_count_with_the_shares_that_are_best_at_the_known_views():
     field, codes, views = scramble(make(sets=3, remainder=False)), torch.randn(2, M), torch.rand(2, 64, 64, 3)
     field.finish(views, codes)
-    errors = [[(draw(one_set(field, k), z, 64, 64) - v)[::8].square().mean() for z, v in zip(codes, views, strict=True)]
-              for k in range(3)]  # fmt: skip
-    inverse = 1 / torch.tensor(errors).mean(1)
-    assert torch.allclose(field.trust, inverse / inverse.sum(), atol=1e-5)
-    alone = torch.stack([draw(one_set(field, k), codes[0], 64, 64) for k in range(3)])
-    assert torch.allclose(draw(field.eval(), codes[0], 64, 64), torch.tensordot(field.trust, alone, 1), atol=1e-5)
+    alone = torch.stack([torch.stack([draw(one_set(field, k), z, 64, 64) for z in codes]) for k in range(3)])
+    mean = torch.tensordot(field.trust, alone, 1)
+    assert torch.allclose(draw(field.eval(), codes[0], 64, 64), mean[0], atol=1e-5)
+    others = torch.tensordot(torch.distributions.Dirichlet(torch.ones(3)).sample((200,)), alone, 1)
+    errors = [(each[:, ::8] - views[:, ::8]).square().mean() for each in (mean, *others, *alone)]
+    assert errors[0] <= 1.001 * min(errors)
+
+
+def test_the_shares_of_guesses_whose_errors_are_independent_are_inverse_to_their_squares():
+    squares = torch.tensor([1.0, 2.0, 4.0]).double()
+    assert torch.allclose(best_shares(squares.diag()), torch.tensor([4.0, 2.0, 1.0]).double() / 7, atol=1e-2)
+    noise = best_shares(squares.diag() + 5)  # of what is guessed, the same for all
+    assert torch.allclose(noise, torch.tensor([4.0, 2.0, 1.0]).double() / 7, atol=1e-2)
+    assert torch.equal(best_shares(torch.ones(1, 1).double()), torch.ones(1).double())
+    assert torch.allclose(best_shares(torch.zeros(4, 4).double()), torch.full((4,), 0.25).double())
+    worse = torch.tensor([[1.0, 1.5], [1.5, 4.0]]).double()  # errs as the first does, and more
+    assert best_shares(worse).tolist() == [1, 0]
+
+
+@given(st.integers(2, 5), st.integers(0, 10**6))
+def test_shares_are_a_mean_and_hardly_worse_than_that_of_all_or_the_best_alone(count, seed):
+    random = torch.Generator().manual_seed(seed)
+    errors = torch.randn(count, 20, generator=random).double() * 10 ** torch.randn(count, 1, generator=random).double()
+    covariance = errors @ errors.T / 20
+    shares = best_shares(covariance)
+    assert shares.min() >= 0
+    assert shares.sum().item() == pytest.approx(1)
+    mean = covariance.diagonal().mean()
+    assert shares @ covariance @ shares <= min(covariance.mean(), covariance.diagonal().min()) + 0.05 * mean
 
 
 @pytest.mark.parametrize("remainder", [False, True])

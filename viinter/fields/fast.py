@@ -23,9 +23,9 @@ A set's colour is the mean of its layers' colours, weighted by a softmax of thei
 which trained more slowly and worse. What is drawn is the mean of the sets, and each is trained to be right by itself:
 where views leave something open, sets settle it differently, and their mean is nearer to the truth than either (as in
 the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. At the end
-each counts by the inverse of its error at the known views: one that took repeating stripes for their neighbours loses
-its voice. A budget that is too short for all of them has fewer. Layered textures read through a homography are the
-multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
+they count with the shares that have the least error at the known views: a set that took repeating stripes for their
+neighbours loses its voice. A budget that is too short for all of them has fewer. Layered textures read through a
+homography are the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
@@ -377,11 +377,8 @@ class FastField(Field):
 
     @torch.no_grad()
     def finish(self, views: Tensor, codes: Tensor) -> None:
-        """Settles how much each set counts, and keeps what the layers leave over of the known views [n, H, W, 3] with
-        codes [n, M].
-
-        The mean of guesses whose errors are independent is best with weights inverse to the squares of the errors.
-        """
+        """Settles how much each set counts (`best_shares` of the errors at the known views), and keeps what the layers
+        leave over of the known views [n, H, W, 3] with codes [n, M]."""
         _, height, width, _ = views.shape
         views, codes = views.movedim(-1, 1).to(self.shift.dtype), codes.to(self.shift.dtype)
         was = self.training
@@ -396,9 +393,9 @@ class FastField(Field):
 
         some, many = slice(None, None, JUDGED), max(1, 65_536 // width)
         pairs = list(zip(views, codes, strict=True))
-        errors = [(shown(z, some) - view[:, some]).square().mean((1, 2, 3)) for view, z in pairs]
-        inverse = 1 / torch.stack(errors).mean(0).clamp_min(1e-12)
-        self.trust[: self.active] = inverse / inverse.sum()
+        errors = [(shown(z, some) - view[:, some]).flatten(1) for view, z in pairs]
+        covariance = torch.stack([own @ own.T / own.shape[1] for own in errors]).mean(0)
+        self.trust[: self.active] = best_shares(covariance.cpu().double()).to(self.trust)
         if len(self.remainder):
             self.places[:, : self.active] = self.place(codes)
             for own, (view, z) in zip(self.remainder, pairs, strict=True):
@@ -458,6 +455,23 @@ def reductions(height: int, width: int, texture_pixels: int) -> list[int]:
     shorter side to about `COARSEST` pixels to the least that brings the view to `texture_pixels` at most."""
     most = max(0, math.ceil(math.log2(min(height, width) / COARSEST)))
     return [2**k for k in range(most, -1, -1) if k == most or height * width <= texture_pixels * 4**k]
+
+
+def best_shares(covariance: Tensor) -> Tensor:
+    """Shares [S] of S guesses, none negative and summing to 1, with which their mean has the least squared error, from
+    the `covariance` [S, S] of their errors (Bates and Granger 1969). What all have in common, noise of what they guess
+    for one, makes no difference. Guesses whose share would be negative are left out, the worst first.
+    """
+    steady = 1e-3 * covariance.diagonal().mean() + 1e-12  # alike guesses get alike shares
+    covariance = covariance + steady * torch.eye(len(covariance)).to(covariance)
+    shares, left = torch.zeros_like(covariance[0]), torch.arange(len(covariance))
+    while len(left):
+        own = torch.linalg.solve(covariance[left][:, left], torch.ones_like(shares[left]))
+        if (own >= 0).all():
+            shares[left] = own / own.sum()
+            break
+        left = left[own > own.min()]
+    return shares
 
 
 def pyramid(levels: list[Tensor]) -> Tensor:
