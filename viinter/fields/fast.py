@@ -393,9 +393,11 @@ class FastField(Field):
 
         some, many = slice(None, None, JUDGED), max(1, 65_536 // width)
         pairs = list(zip(views, codes, strict=True))
-        errors = [(shown(z, some) - view[:, some]).flatten(1) for view, z in pairs]
-        covariance = torch.stack([own @ own.T / own.shape[1] for own in errors]).mean(0)
-        self.trust[: self.active] = best_shares(covariance.cpu().double()).to(self.trust)
+        covariance = torch.zeros(self.active, self.active).double()
+        for view, z in pairs:
+            errors = (shown(z, some) - view[:, some]).flatten(1)
+            covariance += (errors @ errors.T).cpu() / errors.numel()
+        self.trust[: self.active] = best_shares(covariance).to(self.trust)
         if len(self.remainder):
             self.places[:, : self.active] = self.place(codes)
             for own, (view, z) in zip(self.remainder, pairs, strict=True):
