@@ -36,12 +36,13 @@ def draw(field: nn.Module, z: Tensor, height: int, width: int, chunk_pixels: int
     runs out, half as many rows are drawn at a time from there on. Raises UserError if one row is too much.
     """
     rows = max(1, chunk_pixels // width)
-    parts = []
+    rgb = torch.empty(height, width, 3, device=z.device)
     grid = pixel_grid(height, width, z.device, torch.promote_types(z.dtype, torch.float32)).view(height, width, 2)
     start = 0
     while start < height:
         try:
-            parts.append(field(grid[start : start + rows].reshape(1, -1, 2), z[None])[0].float())
+            part = rgb[start : start + rows]
+            part.view(-1, 3).copy_(field(grid[start : start + rows].reshape(1, -1, 2), z[None])[0])
         except (torch.OutOfMemoryError, RuntimeError) as error:
             # on the CPU it is a RuntimeError like any other but for its words
             if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
@@ -51,7 +52,7 @@ def draw(field: nn.Module, z: Tensor, height: int, width: int, chunk_pixels: int
             rows //= 2
         else:
             start += rows
-    return torch.cat(parts).reshape(height, width, 3)
+    return rgb
 
 
 def draw_strip(field: nn.Module, codes: Tensor, scene: Scene, chunk_pixels: int) -> Tensor:
