@@ -36,7 +36,7 @@ def draw(field: nn.Module, z: Tensor, height: int, width: int, chunk_pixels: int
     runs out, half as many rows are drawn at a time from there on. Raises UserError if one row is too much.
     """
     rows = max(1, chunk_pixels // width)
-    rgb = torch.empty(height, width, 3, device=z.device)
+    rgb = torch.empty(height, width, 3, dtype=torch.float32, device=z.device)
     grid = pixel_grid(height, width, z.device, torch.promote_types(z.dtype, torch.float32)).view(height, width, 2)
     start = 0
     while start < height:
