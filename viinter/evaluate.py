@@ -25,7 +25,7 @@ from viinter.scenes import Probe
 from viinter.train import about, describe, write_json
 from viinter.views import draw, measure
 
-TOGETHER = 32_768  # pixels in a step of finetuning, of all probes
+GRADIENTS = 4  # times the memory of drawing a pixel, about, that a step of finetuning takes
 
 ABOUT = """
 Measures the known views and probes of a finished run: PSNR, SSIM, MSE, for every image and on average; then the probes
@@ -90,11 +90,11 @@ def finetune(
 
     A code is not held on the sphere: a mix lies inside it. Its step is measured against the code book's own scale,
     which the norm's order changes by orders of magnitude, and falls to zero along a cosine. Several probes take their
-    steps side by side, as many as `TOGETHER` allows; none knows of the others.
+    steps side by side, as many as `cfg.chunk_pixels` allows; none knows of the others.
     """
     found = []
     first = cfg.finetune_lr * codes.square().mean().sqrt().item()
-    many = max(1, TOGETHER // cfg.finetune_pixels)
+    many = max(1, cfg.chunk_pixels // (GRADIENTS * cfg.finetune_pixels))
     groups = [probes[k : k + many] for k in range(0, len(probes), many)]
     with Progress(console=console) as progress:
         task = progress.add_task("finetuning codes", total=len(groups) * cfg.finetune_steps)
