@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "viinter"
 FLOORS = [
-    ["config", "files", "image", "video", "codes", "features", "memory", "metrics", "replay",
+    ["config", "files", "image", "video", "codes", "features", "memory", "metrics", "optical_flow", "replay",
      "fields.field", "fields.paper", "fields.fast"],
     ["scenes"],
     ["data", "module", "views", "peers"],
@@ -18,6 +18,7 @@ FLOORS = [
 # the few steps within a floor, each from the plainer to the one that uses it
 WITHIN = {
     ("files", "config"), ("image", "config"), ("image", "files"), ("video", "config"), ("video", "files"),
+    ("optical_flow", "config"), ("optical_flow", "metrics"),
     ("features", "config"), ("fields.paper", "fields.field"), ("fields.fast", "fields.field"),
     ("module", "data"), ("checkpoints", "callbacks"), ("train", "command"),
     ("evaluate", "command"), ("render", "command"),

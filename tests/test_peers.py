@@ -40,6 +40,7 @@ def test_flow_finds_the_view_between_where_a_cross_fade_does_not(share):
     found = peers.measure(scene(moved(share)))
     assert found["flow"]["psnr"] > found["blend"]["psnr"] + 5
     assert set(found["flow"]["per_view"]) == {f"at {share}"}
+    assert found["flow"]["registered"]["psnr"] > found["blend"]["registered"]["psnr"] + 5
 
 
 def test_flow_of_a_still_scene_is_the_view_itself():
@@ -52,6 +53,7 @@ def test_without_opencv_or_probes_the_reason_is_given(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     found = peers.measure(scene(moved(0.5)))
     assert found["blend"]["psnr"] > 10
+    assert 'pip install "viinter[peers]"' in found["blend"]["registered"]
     assert 'pip install "viinter[peers]"' in found["flow"]
     assert peers.measure(scene()) == dict.fromkeys(("blend", "flow"), "the scene has no probes")
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 
 import av
 import pytest
@@ -229,6 +230,19 @@ def test_finetuned_codes_show_the_probes_better_than_mixed_ones(evaluated):
     assert finetuned["psnr"] > novel["psnr"] + 0.5
     for name, errors in finetuned["per_view"].items():
         assert errors["mse"] < 1.05 * novel["per_view"][name]["mse"]
+
+
+def test_probes_are_registered_if_there_is_opencv(run, evaluated, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("cv2")
+    novel, registered = evaluated[0]["novel"], evaluated[0]["registered"]
+    assert registered["per_view"].keys() == novel["per_view"].keys()
+    assert registered["psnr"] != novel["psnr"]
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    shutil.copytree(run, tmp_path / "run")
+    found = evaluate(EvaluateConfig(run=str(tmp_path / "run"), finetune_steps=0))
+    assert "registered" not in found
+    assert found["novel"] == novel
+    assert 'not registered: optical flow needs OpenCV: pip install "viinter[peers]"' in capsys.readouterr().out
 
 
 def test_finetuning_leaves_field_and_codes_as_they_were(run, evaluated):

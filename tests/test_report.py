@@ -100,6 +100,11 @@ def test_codes_of_the_probes_stand_side_by_side():
     found = comparisons.probe_codes([posed, bare], published())
     assert found.rows[1] == ["knights", "0.500", "- (not measured)", "0.600", "30.00", "- (not measured)", "30.50",
                              "+0.50"]  # fmt: skip
+    posed.evaluation = {"registered": {"psnr": 24.7, "ssim": 0.84}}
+    found = comparisons.probe_codes([posed], published())
+    assert found.columns[1:4] == ["SSIM interpolated", "SSIM registered", "SSIM posed"]
+    assert found.rows[0] == ["fern", "0.500", "0.840", "0.800", "15.00", "24.70", "24.50", "-"]
+    assert "moved onto the photograph" in found.notes[-1]
 
 
 # Sweeps with holes

@@ -157,12 +157,14 @@ def towers(runs: list[Run], paper: dict[str, Any]) -> Table:
     return Table("L_inter by tower", columns, rows, [f"Paper: {cost['source']}. Here: {marked(runs)}."])
 
 
-CODES = {"novel": "interpolated", "novel_posed": "posed", "finetuned": "finetuned"}  # what gave a probe its code
+# what gave a probe its code
+CODES = {"novel": "interpolated", "registered": "registered", "novel_posed": "posed", "finetuned": "finetuned"}
 
 
 def probe_codes(runs: list[Run], paper: dict[str, Any]) -> Table | None:
-    """The same probes under interpolated codes, codes placed by all cameras' poses, and codes finetuned by
-    `viinter.evaluate`, for runs that have one of the last two; None if there are none."""
+    """The same probes under interpolated codes, as they are and registered by `viinter.evaluate`, under codes placed by
+    all cameras' poses, and under codes finetuned by `viinter.evaluate`, for runs that have more than the first; None if
+    there are none."""
     measured = [run for run in runs if any(run.value(kind, "psnr") is not None for kind in list(CODES)[1:])]
     if not measured:
         return None
@@ -182,6 +184,8 @@ def probe_codes(runs: list[Run], paper: dict[str, Any]) -> Table | None:
         rows.append([f"paper, {layout}", *line, f"{of['finetuned']['psnr'] - of['novel']['psnr']:+.2f}"])
     columns = ["scene", *(f"{UNITS[number]} {CODES[kind]}" for number, kind in both), "finetuned gains dB"]
     notes = [f"Paper: {paper['table_3']['source']}. Here: {marked(measured)}.", SSIM_NOTE]
+    if "registered" in kinds:
+        notes.append("Registered: interpolated, each picture moved onto the photograph by optical flow first.")
     return Table("Codes of the probes", columns, rows, notes)
 
 

@@ -21,6 +21,7 @@ from viinter.codes import mix
 from viinter.config import ConfigError, EvaluateConfig, TrainConfig
 from viinter.data import PixelStore
 from viinter.module import ViewInterpolator, load, run_device
+from viinter.optical_flow import measure_registered
 from viinter.scenes import Probe
 from viinter.train import about, describe, write_json
 from viinter.views import draw, measure
@@ -29,7 +30,8 @@ GRADIENTS = 4  # times the memory of drawing a pixel, about, that a step of fine
 
 ABOUT = """
 Measures the known views and probes of a finished run: PSNR, SSIM, MSE, for every image and on average; then the probes
-with codes finetuned against their own images, the field frozen. Writes RUN/evaluation.json.
+with codes finetuned against their own images, the field frozen. With OpenCV also the probes "registered": each picture
+is first moved onto the photograph, so that what it shows counts and not where. Writes RUN/evaluation.json.
 
   python -m viinter.evaluate run=outputs/demo/paper/DATE_TIME
   python -m viinter.evaluate run=... finetune_steps=0                without finetuned codes
@@ -40,7 +42,8 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
     """Measures the run folder `cfg.run` and writes `evaluation.json` there.
 
     Returns:
-        `known`, `novel`, ... as in `metrics.json`, and `finetuned` for the standard probes.
+        `known`, `novel`, ... as in `metrics.json`; for the standard probes also `finetuned` and, with OpenCV,
+        `registered` (`optical_flow.registered`).
 
     Raises:
         UserError: no run folder, or the scene's images are not those it was trained on.
@@ -55,11 +58,22 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
         raise ConfigError(f"{trained.scene.root} no longer holds the known views that {cfg.run} was trained on")
     console.print(describe(scene))
     codes = model.codes.weight.detach()
-    with console.status("measuring every view") as status, as_trained(model, trained):
-        found: dict[str, Any] = measure(
-            model.field, codes, scene, None, cfg.chunk_pixels,
-            lambda kind, k, *_: status.update(f"measuring {kind} {k + 1}"),
-        )  # fmt: skip
+    drawn = {}
+    with console.status("measuring every view") as status:
+
+        def seen(kind: str, k: int, image: Tensor, target: Tensor) -> None:
+            status.update(f"measuring {kind} {k + 1}")
+            if kind == "novel":
+                drawn[scene.probes[kind][k].name] = image.cpu(), target.cpu()
+
+        with as_trained(model, trained):
+            found: dict[str, Any] = measure(model.field, codes, scene, None, cfg.chunk_pixels, seen)
+        if drawn:
+            status.update("registering the probes")
+            found["registered"] = measure_registered(drawn)
+    if isinstance(reason := found.get("registered"), str):
+        console.print(f"The probes were not registered: {reason}", highlight=False, markup=False, soft_wrap=True)
+        del found["registered"]
     if cfg.finetune_steps and scene.probes["novel"]:
         errors, probes = {}, scene.probes["novel"]
         for probe, z in zip(probes, finetune(model.field, codes, probes, cfg, console), strict=True):

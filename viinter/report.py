@@ -90,8 +90,8 @@ def against_time(of: list[Run]) -> list[Table | Picture | str]:
     if not any(run.metrics for run in of):
         return []
     named = untrained(of)
-    peer_rows = [[name, peer, _text(found, "psnr"), _text(found, "ssim")] for name, peers_found in named.items()
-                 for peer, found in peers_found.items()]  # fmt: skip
+    peer_rows = [[name, peer, _text(found, "psnr"), _text(found, "ssim"), _registered(found)]
+                 for name, peers_found in named.items() for peer, found in peers_found.items()]  # fmt: skip
     # a line in a plot of one scene alone
     one = next(iter(named.values())) if len(named) == 1 else {}
     mse, psnr = ({k: f[key] for k, f in one.items() if not isinstance(f, str)} for key in ("mse", "psnr"))
@@ -103,8 +103,9 @@ def against_time(of: list[Run]) -> list[Table | Picture | str]:
         curves,
         *([work] if len(budgets) > 1 else []),
         evidence.times_to_targets(of),
-        Table("Without training", ["scene", "peer", "novel PSNR", "novel SSIM"], peer_rows,
-              ["`blend`: cross-fade of a probe's known views. `flow`: both warped to it along DIS optical flow."]),
+        Table("Without training", ["scene", "peer", "novel PSNR", "novel SSIM", "registered PSNR"], peer_rows,
+              ["`blend`: cross-fade of a probe's known views. `flow`: both warped to it along DIS optical flow.",
+               "Registered: each picture moved onto the photograph by optical flow first."]),
         *([evidence.where_time_goes(of)] if any("seconds" in (run.metrics or {}) for run in of) else []),
         evidence.omitted(of),
     ]  # fmt: skip
@@ -126,6 +127,10 @@ def untrained(of: list[Run]) -> dict[str, dict[str, Any]]:
 
 def _text(found: dict[str, Any] | str, key: str) -> str:
     return f"- [{found}]" if isinstance(found, str) else comparisons.number(found[key], comparisons.DIGITS[key])
+
+
+def _registered(found: dict[str, Any] | str) -> str:
+    return "-" if isinstance(found, str) else _text(found["registered"], "psnr")
 
 
 # What the report shows of each experiment: (runs, the paper's numbers) -> items

@@ -18,6 +18,8 @@ from omegaconf import OmegaConf
 from viinter import config
 from viinter.config import ConfigError, UserError
 
+EVALUATED = ("finetuned", "registered")  # what `viinter.evaluate` measures and training does not
+
 
 @dataclass
 class Run:
@@ -41,8 +43,8 @@ class Run:
         return None if self.settings is None else self.settings.get(key)
 
     def value(self, kind: str, key: str) -> float | None:
-        """The mean `key` (psnr, ssim, mse) of `kind` (known, novel, ..., finetuned); None if it was not measured."""
-        found = ((self.evaluation or {}) if kind == "finetuned" else (self.metrics or {})).get(kind)
+        """The mean `key` (psnr, ssim, mse) of `kind` (known, novel, ..., `EVALUATED`); None if it was not measured."""
+        found = ((self.evaluation or {}) if kind in EVALUATED else (self.metrics or {})).get(kind)
         return found[key] if found else None
 
     def measured_every(self, kind: str) -> int:
