@@ -59,10 +59,12 @@ def registered(image: Tensor, target: Tensor) -> Tensor:
 def measure_registered(drawn: dict[str, tuple[Tensor, Tensor]]) -> dict[str, Any] | str:
     """`metrics.summary` of pairs (image, target), each `registered` first; or the reason why there is none."""
     try:
-        pairs = {name: (registered(image, target), target.cpu()) for name, (image, target) in drawn.items()}
+        errors = {
+            name: metrics.compare(registered(image, target), target.cpu()) for name, (image, target) in drawn.items()
+        }
     except UserError as error:
         return str(error)
-    return metrics.summary({name: metrics.compare(*pair) for name, pair in pairs.items()})
+    return metrics.summary(errors)
 
 
 def _opencv() -> ModuleType:
