@@ -70,10 +70,12 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
             found: dict[str, Any] = measure(model.field, codes, scene, None, cfg.chunk_pixels, seen)
         if drawn:
             status.update("registering the probes")
-            found["registered"] = measure_registered(drawn)
-    if isinstance(reason := found.get("registered"), str):
-        console.print(f"The probes were not registered: {reason}", highlight=False, markup=False, soft_wrap=True)
-        del found["registered"]
+            registered = measure_registered(drawn)
+            if isinstance(registered, str):
+                why = f"The probes were not registered: {registered}"
+                console.print(why, highlight=False, markup=False, soft_wrap=True)
+            else:
+                found["registered"] = registered
     if cfg.finetune_steps and scene.probes["novel"]:
         errors, probes = {}, scene.probes["novel"]
         for probe, z in zip(probes, finetune(model.field, codes, probes, cfg, console), strict=True):

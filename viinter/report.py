@@ -105,7 +105,7 @@ def against_time(of: list[Run]) -> list[Table | Picture | str]:
         evidence.times_to_targets(of),
         Table("Without training", ["scene", "peer", "novel PSNR", "novel SSIM", "registered PSNR"], peer_rows,
               ["`blend`: cross-fade of a probe's known views. `flow`: both warped to it along DIS optical flow.",
-               "Registered: each picture moved onto the photograph by optical flow first."]),
+               comparisons.REGISTERED_NOTE]),
         *([evidence.where_time_goes(of)] if any("seconds" in (run.metrics or {}) for run in of) else []),
         evidence.omitted(of),
     ]  # fmt: skip
