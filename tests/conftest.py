@@ -21,6 +21,8 @@ from omegaconf import OmegaConf
 
 from viinter import config, features, image
 from viinter.config import TrainConfig
+from viinter.fields.field import Field
+from viinter.views import pixel_grid
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 REAL = REPOSITORY.parent / "shared" / "data"
@@ -294,3 +296,42 @@ def fake_tower(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 WITH_TOWER = {"interpolation.alpha": 0.1, "features.extractor": "fake", "features.patches": "cover"}
+
+
+def fit(field: Field, views: torch.Tensor, codes: torch.nn.Parameter, steps: int = 400) -> None:
+    """Trains on rows of the square `views` [n, H, H, 3], as `viinter.train` does, and finishes."""
+    size = views.shape[1]
+    field.calibrate(codes)
+    field.see(views)
+    groups = field.parameter_groups(codes)
+    optimizer = torch.optim.Adam([{"params": g["params"], "lr": 0.02 * g["share"]} for g in groups], betas=(0.9, 0.99))
+    first = [g["lr"] for g in optimizer.param_groups]
+    rows = pixel_grid(size, size).view(size, size, 2)
+    random = torch.Generator().manual_seed(0)
+    for step in range(steps):
+        field.at(step / steps, step)
+        for group, lr, rate in zip(optimizer.param_groups, first, field.rates(), strict=True):
+            group["lr"] = lr * rate * (0.05 + 0.95 * (1 + math.cos(math.pi * step / steps)) / 2)
+        seen = torch.randint(len(views), (size,), generator=random)
+        rgb = views[seen, torch.arange(size)]
+        loss = field.loss(seen, rows, rgb, codes)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    field.finish(views, codes.detach())
+    field.eval()
+
+
+def random_codes(count: int, code_dim: int) -> torch.nn.Parameter:
+    codes = torch.randn(count, code_dim, generator=torch.Generator().manual_seed(1))
+    return torch.nn.Parameter(codes / codes.abs().sum(-1, keepdim=True))
+
+
+def blobs(height: int, width: int, seed: int) -> torch.Tensor:
+    """A smooth random picture [3, H, W], 16 pixels from blob to blob."""
+    coarse = torch.rand(1, 3, height // 16, width // 16, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic")[0].clamp(0, 1)
+
+
+def decibel(image: torch.Tensor, target: torch.Tensor) -> float:
+    return -10 * (image.clamp(0, 1) - target).square().mean().log10().item()

@@ -1,10 +1,10 @@
 """The fast field: motion, levels, remainders, and a small scene that moves."""
 
-import math
 import pickle
 
 import pytest
 import torch
+from conftest import blobs, decibel, fit, random_codes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -372,45 +372,6 @@ def test_training_again_leaves_the_remainder_out():
     assert torch.allclose(draw(field, codes[0], 64, 64), bare, atol=1e-6)
 
 
-def fit(field: FastField, views: torch.Tensor, codes: torch.nn.Parameter, steps: int = 400) -> None:
-    """Trains on rows of the square `views` [n, H, H, 3], as `viinter.train` does, and finishes."""
-    size = views.shape[1]
-    field.calibrate(codes)
-    field.see(views)
-    groups = field.parameter_groups(codes)
-    optimizer = torch.optim.Adam([{"params": g["params"], "lr": 0.02 * g["share"]} for g in groups], betas=(0.9, 0.99))
-    first = [g["lr"] for g in optimizer.param_groups]
-    rows = pixel_grid(size, size).view(size, size, 2)
-    random = torch.Generator().manual_seed(0)
-    for step in range(steps):
-        field.at(step / steps, step)
-        for group, lr, rate in zip(optimizer.param_groups, first, field.rates(), strict=True):
-            group["lr"] = lr * rate * (0.05 + 0.95 * (1 + math.cos(math.pi * step / steps)) / 2)
-        seen = torch.randint(len(views), (size,), generator=random)
-        rgb = views[seen, torch.arange(size)]
-        loss = (field(rows, codes[seen]) - rgb).square().mean() + field.penalty(seen, rgb, codes)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    field.finish(views, codes.detach())
-    field.eval()
-
-
-def random_codes(count: int) -> torch.nn.Parameter:
-    codes = torch.randn(count, M, generator=torch.Generator().manual_seed(1))
-    return torch.nn.Parameter(codes / codes.abs().sum(-1, keepdim=True))
-
-
-def blobs(height: int, width: int, seed: int) -> torch.Tensor:
-    """A smooth random picture [3, H, W], 16 pixels from blob to blob."""
-    coarse = torch.rand(1, 3, height // 16, width // 16, generator=torch.Generator().manual_seed(seed))
-    return torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic")[0].clamp(0, 1)
-
-
-def decibel(image: torch.Tensor, target: torch.Tensor) -> float:
-    return -10 * (image.clamp(0, 1) - target).square().mean().log10().item()
-
-
 @pytest.mark.parametrize("texture_pixels", [64**2, 32**2])
 def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross_faded(texture_pixels):
     """Five views of a texture that moves 4 pixels from each to the next; the views half way between were never seen."""
@@ -421,7 +382,7 @@ def test_a_scene_that_slides_is_learned_and_its_unseen_middle_is_drawn_not_cross
         wider = wide[:, 8:136, 40 - moved : 168 - moved]
         return torch.nn.functional.avg_pool2d(wider, 2).permute(1, 2, 0)
 
-    codes, views = random_codes(5), torch.stack([view(k) for k in range(5)])
+    codes, views = random_codes(5, M), torch.stack([view(k) for k in range(5)])
     field = make(64, 64, views=5, layers=2, texture_pixels=texture_pixels)
     fit(field, views, codes)
     for k in range(4):
@@ -441,7 +402,7 @@ def test_between_two_pictures_what_moves_by_itself_is_half_way():
         front = before[:, 16 - down : 80 - down, 16:80]
         return (front * disc + behind[:, 16:80, 16 - right : 80 - right] * (1 - disc)).movedim(0, -1)
 
-    codes, views = random_codes(2), torch.stack([view(0), view(1)])
+    codes, views = random_codes(2, M), torch.stack([view(0), view(1)])
     field = make(64, 64, views=2, layers=4)
     fit(field, views, codes)
     drawn = draw(field, codes.detach().mean(0), 64, 64)

@@ -63,7 +63,7 @@ def test_stages_follow_the_levels(make_config):
         model.field.at(progress, 0)
         stages.append(model.field.stage())
     assert stages == [0, 0, 1]
-    assert modules.make_field(make_config().model, 2, 8, 8).stage() == 0
+    assert modules.make_field(make_config(), 2, 8, 8).stage() == 0
     assert Field().stage() is None
 
 

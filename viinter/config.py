@@ -155,6 +155,9 @@ class FastModel(ModelConfig):
     entropy: float = setting(1e-3, "weight of the penalty on pixels that mix layers")
     smooth: float = setting(2e-3, "weight of the penalty on disparities that differ between pixels of one colour")
     consistency: float = setting(1.0, "weight of the penalty on pixels that a known view nearby does not have there")
+    window: int | None = setting(
+        None, "views in a row, as files are sorted, that have layers of their own; null: 3 in a studio ring, else all"
+    )
     remainder: bool = setting(True, "keep what the layers leave over of each known view, and share it out")
 
 
@@ -347,6 +350,8 @@ def check(cfg: TrainConfig) -> None:
         for key in ("entropy", "smooth", "consistency"):
             value = getattr(cfg.model, key)
             want(value >= 0, f"model.{key}", value, "0 or more")
+        window = cfg.model.window
+        want(window is None or window >= 2, "model.window", window, "2 or more, or null")
         want(cfg.trainer.precision not in ("16-true", "bf16-true"), "trainer.precision", cfg.trainer.precision,
              "32-true, 64-true or a mixed one with model=fast: its motions are finer than 16 bits")  # fmt: skip
     want(cfg.interpolation.alpha >= 0, "interpolation.alpha", cfg.interpolation.alpha, "0 or more")

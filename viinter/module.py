@@ -12,24 +12,26 @@ from typing import Any
 
 import lightning as L
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from viinter.codes import CodeBook
-from viinter.config import ConfigError, ModelConfig, TrainConfig, from_plain, norm_order, plain
+from viinter.config import ConfigError, Layout, TrainConfig, from_plain, norm_order, plain
 from viinter.data import PixelBatch
+from viinter.fields.charts import WINDOW, ChartedField
 from viinter.fields.fast import FastField
 from viinter.fields.field import Field
 from viinter.fields.paper import PaperField
 from viinter.replay import ReplayedLoss
 
 
-def make_field(cfg: ModelConfig, n: int, height: int, width: int) -> Field:
-    """The field that a model configuration (`config.MODELS`) describes, for `n` views of `height` x `width`."""
-    settings = {k: v for k, v in plain(cfg).items() if k != "name"}
-    if cfg.name == "fast":
-        return FastField(views=n, height=height, width=width, **settings)
-    return PaperField(**settings)
+def make_field(cfg: TrainConfig, n: int, height: int, width: int) -> Field:
+    """The field that a configuration's model (`config.MODELS`) describes, for `n` views of `height` x `width`."""
+    settings = {k: v for k, v in plain(cfg.model).items() if k != "name"}
+    if cfg.model.name == "paper":
+        return PaperField(**settings)
+    settings |= {"views": n, "height": height, "width": width}
+    window = settings.pop("window") or (WINDOW if cfg.scene.layout is Layout.studio else n)
+    return FastField(**settings) if window >= n else ChartedField(window=window, **settings)
 
 
 class ViewInterpolator(L.LightningModule):
@@ -47,7 +49,7 @@ class ViewInterpolator(L.LightningModule):
     def __init__(self, cfg: TrainConfig, n: int, about: dict[str, Any]) -> None:
         super().__init__()
         self.cfg, self.about = cfg, about
-        self.field = make_field(cfg.model, n, about["height"], about["width"])
+        self.field = make_field(cfg, n, about["height"], about["width"])
         self.codes = CodeBook(n, cfg.model.code_dim, norm_order(cfg.codes.p), cfg.codes.radius, cfg.codes.length)
         self.codes.project_()
         self.field.calibrate(self.codes.weight)
@@ -73,10 +75,8 @@ class ViewInterpolator(L.LightningModule):
         return self.replayed[1](*batch)
 
     def loss(self, view: Tensor, xy: Tensor, rgb: Tensor) -> Tensor:
-        """The mean squared error of the pixels of a `PixelBatch`, and the field's penalty."""
-        codes = self.codes.weight
-        error = F.mse_loss(self.field(xy, codes.index_select(0, view)), rgb)
-        return error + self.field.penalty(view, rgb, codes)
+        """The field's loss (`fields.field.Field.loss`) of a `PixelBatch`."""
+        return self.field.loss(view, xy, rgb, self.codes.weight)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam over field and codes (supplement); the rate is set before each step by `callbacks.Budget`."""

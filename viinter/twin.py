@@ -38,11 +38,12 @@ def model_and_batch(cfg: TrainConfig) -> tuple[ViewInterpolator, PixelBatch]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(cfg.seed)
         model = ViewInterpolator(cfg, VIEWS, {"height": SIDE, "width": SIDE})
-        if isinstance(model.field, FastField):
-            model.field.at(1.0)
-            with torch.no_grad():
-                for values in (*model.field.colours, *model.field.weights, model.field.delta, model.field.bend):
-                    values.add_(0.05 * torch.randn_like(values))
+        for field in model.field.modules():
+            if isinstance(field, FastField):
+                field.at(1.0)
+                with torch.no_grad():
+                    for values in (*field.colours, *field.weights, field.delta, field.bend):
+                        values.add_(0.05 * torch.randn_like(values))
         batch = PixelBatch(
             torch.arange(VIEWS), torch.rand(VIEWS, PIXELS, 2) * 2 - 1, torch.rand(VIEWS, PIXELS, 3)
         )

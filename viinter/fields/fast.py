@@ -40,7 +40,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -48,7 +48,6 @@ from torch import Tensor, nn
 
 from viinter.fields.field import Field
 
-COARSEST = 32  # pixels of the shorter side at the first level: no motion between views is far there
 MOST = 100, 300  # steps at each of the coarse levels, and at half size
 ENOUGH = 1500, 60  # steps, and passes over the known pixels: after both more time only learns known views by heart
 FEWEST = 300  # steps for which a budget in seconds should be enough, or sets are left out
@@ -63,6 +62,24 @@ GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole part
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 
 
+class Pace(NamedTuple):
+    """How a field goes from coarse to fine, found by trial (docs/fast.md).
+
+    `coarsest`: pixels of a view's shorter side at the first level, where no motion between views should be far.
+    `coarse`, `half`: shares of the budget after which the levels coarser than half size are finished, and that of half
+    size. `shift`, `bend`: rates of the motion, and of its polynomials but the constant one.
+    """
+
+    coarsest: int
+    coarse: float
+    half: float
+    shift: float
+    bend: float
+
+
+STEADY = Pace(32, 0.12, 0.30, 0.1, 0.025)  # views near one another, many to each layer
+
+
 class FastField(Field):
     """F(xy | z) -> rgb from `sets` of `layers` textures each, for `views` known views of `height` x `width`.
 
@@ -74,19 +91,19 @@ class FastField(Field):
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
                  margin: float, texture_pixels: int, sharpness: float, entropy: float, smooth: float,
-                 consistency: float, remainder: bool) -> None:  # fmt: skip
+                 consistency: float, remainder: bool, pace: Pace = STEADY) -> None:  # fmt: skip
         super().__init__()
         self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
         self.drawn: tuple[Tensor, ...] = ()
         self.known: Tensor | None = None
         self.maps: Tensor | None = None
         self.kept: dict[str, tuple[list, Tensor]] = {}
-        self.margin, self.sharpness, self.motion = margin, sharpness, motion
+        self.margin, self.sharpness, self.motion, self.pace = margin, sharpness, motion, pace
         self.entropy, self.smooth, self.consistency = entropy, smooth, consistency
         self.pitch = 2 / width
         self.shape, self.active = (sets, layers), sets
         layers *= sets  # those of a set one after the other
-        self.reductions = reductions(height, width, texture_pixels)
+        self.reductions = reductions(height, width, texture_pixels, pace.coarsest)
         sizes = [(round(height * margin / by), round(width * margin / by)) for by in self.reductions]
         count = len(sizes)
         self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
@@ -125,8 +142,8 @@ class FastField(Field):
         return [
             {"params": [*self.colours, *self.weights], "share": 1.0},
             {"params": [self.delta], "share": 0.5},
-            {"params": [self.shift, self.disparity], "share": 0.1},
-            {"params": [self.bend], "share": 0.025},
+            {"params": [self.shift, self.disparity], "share": self.pace.shift},
+            {"params": [self.bend], "share": self.pace.bend},
             {"params": [codes], "share": 2.5 / self.gain.item()},
         ]
 
@@ -138,14 +155,14 @@ class FastField(Field):
     def at(self, progress: float, step: int = 0) -> None:
         """Chooses the level in training for the share of the budget that is used, in [0, 1], and the step.
 
-        The finest level has 70 % of the budget, the one before 18 %, the coarser ones share the rest, but none of them
-        more steps than `MOST`: textures that are finished before the motion is known hold it where it is. The penalty
-        on mixed weights is faded in over the finest level's first part: a decision made then is often wrong too.
+        `Pace` lays the levels over the budget, the finest with most of it, but none before that has more steps than
+        `MOST`: textures that are finished before the motion is known hold it where it is. The penalty on mixed weights
+        is faded in over the finest level's first part: a decision made then is often wrong too.
         """
         self.finished.fill_(False)
         count = len(self.colours)
-        coarse = count - 2
-        ends = [0.12 * (k + 1) / coarse for k in range(coarse)] + [0.30, 1.0]
+        coarse, half = count - 2, self.pace.half
+        ends = [self.pace.coarse * (k + 1) / coarse for k in range(coarse)] + [half, 1.0]
         most = [MOST[0] * (k + 1) for k in range(coarse)] + [MOST[0] * max(0, coarse) + MOST[1], math.inf]
         stages = zip(ends[-count:], most[-count:], strict=True)
         level = next((k for k, (end, last) in enumerate(stages) if progress < end and step < last), count - 1)
@@ -154,7 +171,7 @@ class FastField(Field):
             self.maps = None
         self.level = level
         self.step.fill_(step)
-        self.decision.fill_(min(max((progress - 0.3) / 0.3, 0.0), 1.0))
+        self.decision.fill_(min(max((progress - half) / 0.3, 0.0), 1.0))
 
     def stage(self) -> int:
         return self.level
@@ -345,6 +362,10 @@ class FastField(Field):
             self.maps = F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
         return self.maps
 
+    def loss(self, view: Tensor, xy: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
+        """The mean squared error, and the `penalty`."""
+        return super().loss(view, xy, rgb, codes) + self.penalty(view, rgb, codes)
+
     def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
         """Four terms on the pixels of the last call.
 
@@ -452,10 +473,10 @@ class FastField(Field):
         return total.movedim(1, -1)
 
 
-def reductions(height: int, width: int, texture_pixels: int) -> list[int]:
+def reductions(height: int, width: int, texture_pixels: int, coarsest: int = STEADY.coarsest) -> list[int]:
     """How many times smaller than a view the textures of each level are: powers of 2, from that which brings a view's
-    shorter side to about `COARSEST` pixels to the least that brings the view to `texture_pixels` at most."""
-    most = max(0, math.ceil(math.log2(min(height, width) / COARSEST)))
+    shorter side to about `coarsest` pixels to the least that brings the view to `texture_pixels` at most."""
+    most = max(0, math.ceil(math.log2(min(height, width) / coarsest)))
     return [2**k for k in range(most, -1, -1) if k == most or height * width <= texture_pixels * 4**k]
 
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 
@@ -56,7 +57,8 @@ class Field(nn.Module):
     def finish(self, views: Tensor, codes: Tensor) -> None:
         """Called once, after the last step, with the known views [n, H, W, 3] and their codes [n, M]."""
 
-    def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor | float:
-        """Added to the mean squared error of the pixels that were drawn last, which have colours `rgb` [V, P, 3] in the
-        known views number `view` [V]; `codes` [n, M] are those of all known views. Called once a step."""
-        return 0.0
+    def loss(self, view: Tensor, xy: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
+        """What a training step makes smaller, from pixels at `xy` [V, P, 2] of the known views number `view` [V] that
+        have colours `rgb` [V, P, 3] there; `codes` [n, M] are those of all known views. The mean squared error over
+        pixels and channels, unless a field has more to ask."""
+        return F.mse_loss(self(xy, codes.index_select(0, view)), rgb)
