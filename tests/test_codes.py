@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from viinter.codes import CodeBook, ease, lerp, mix, p_norm, path, project, radius_of_length
+from viinter.codes import CodeBook, along, ease, lerp, mix, p_norm, path, project, radius_of_length
 
 orders = st.one_of(st.just(math.inf), st.just(1.0), st.floats(1, 100))
 scales = st.floats(-30, 30).map(lambda e: 10.0**e)
@@ -90,6 +90,20 @@ def test_a_path_passes_its_views_at_the_stated_frames(stops, frames, smooth):
     for k, view in enumerate(views):
         assert torch.allclose(line[k * frames], codes[view], atol=1e-6)
         assert torch.allclose(ring[k * frames], codes[view], atol=1e-6)
+
+
+@given(st.integers(2, 5), st.integers(1, 6))
+def test_codes_along_views_are_those_of_a_path_if_they_meet_them(stops, frames):
+    codes, views = normal(1, 5, 3), list(range(stops))
+    assert torch.allclose(along(codes, views, (stops - 1) * frames + 1), path(codes, views, frames), atol=1e-5)
+
+
+@given(st.integers(2, 5), st.integers(2, 50))
+def test_codes_along_views_go_from_the_first_to_the_last_in_steps_of_one_length(stops, count):
+    codes = torch.arange(5.0)[:, None]  # one line, so that corners cannot shorten a step
+    found = along(codes, list(range(stops)), count)[:, 0]
+    assert found[[0, -1]].tolist() == [0, stops - 1]
+    assert torch.allclose(found.diff(), torch.tensor((stops - 1) / (count - 1)), atol=1e-5)
 
 
 def test_easing_starts_and_ends_at_rest():

@@ -657,6 +657,12 @@ def test_most_pixels_are_kept_to_by_a_whole_factor(tmp_path, downsample, most, s
     assert (scene.height, scene.width) == size
 
 
+def test_only_in_a_studio_a_demonstration_passes_the_views_between_its_endpoints():
+    assert scenes.tour(Layout.studio, (1, 4)) == [1, 2, 3, 4]
+    assert scenes.tour(Layout.studio, (4, 2)) == [4, 3, 2]
+    assert scenes.tour(Layout.planar, (1, 4)) == [1, 4]
+
+
 @pytest.mark.parametrize("endpoints", [[0, 3], [-1, 1], [1, 1], [1]])
 def test_endpoints_are_known_views(tmp_path, endpoints):
     draw(tmp_path, ["a.png", "b.png", "c.png"])

@@ -72,6 +72,14 @@ def path(codes: Tensor, views: list[int], frames: int, smooth: bool = False, loo
     return torch.cat(legs if loop else [*legs, codes[stops[-1]][None]])
 
 
+def along(codes: Tensor, views: list[int], count: int) -> Tensor:
+    """`count` codes [count, M] evenly spaced along straight lines through the known `views`, both ends included."""
+    stops, legs = codes[views], len(views) - 1
+    t = torch.linspace(0, legs, count, device=codes.device, dtype=codes.dtype)
+    leg = t.long().clamp_max(legs - 1)
+    return lerp(stops[leg], stops[leg + 1], (t - leg)[:, None])
+
+
 def radius_of_length(length: float, p: float, code_dim: int) -> float:
     """The mean p-norm of normal random codes of `code_dim` entries, scaled to the Euclidean `length`.
 

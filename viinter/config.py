@@ -272,7 +272,9 @@ class RenderConfig:
     """`python -m viinter.render`."""
 
     run: str = setting(MISSING, "run folder")
-    path: list[int] | None = setting(None, "known views to pass through, such as [0,4,24]; null: the endpoints")
+    path: list[int] | None = setting(
+        None, "known views to pass through, such as [0,4,24]; null: the endpoints, in a studio scene those between too"
+    )
     corners: list[int] | None = setting(
         None, "four known views [top left, top right, bottom left, bottom right]: their mixes, in place of a path"
     )

@@ -18,6 +18,7 @@ from torch import Tensor
 from viinter import codes, command, image, video
 from viinter.config import ConfigError, Easing, FrameFormat, RenderConfig
 from viinter.module import load, run_device
+from viinter.scenes import tour
 from viinter.views import draw
 
 ABOUT = """
@@ -52,7 +53,8 @@ def render(cfg: RenderConfig) -> dict[str, Any]:
                           "expected at least 1, 2, above 0, 1")  # fmt: skip
     if cfg.path is not None and cfg.corners is not None:
         raise ConfigError(f"path={cfg.path} and corners={cfg.corners}: expected one of the two")
-    views = next(v for v in (cfg.corners, cfg.path, about["endpoints"]) if v is not None)
+    way = tour(model.cfg.scene.layout, about["endpoints"])
+    views = next(v for v in (cfg.corners, cfg.path, way) if v is not None)
     unknown = [v for v in views if not 0 <= v < len(book)]
     if unknown:
         raise ConfigError(f"view {unknown[0]} is not one of the {len(book)} known views, 0 to {len(book) - 1}")

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -100,6 +100,10 @@ class Scene:
     def width(self) -> int:
         return self.views.shape[2]
 
+    @property
+    def tour(self) -> list[int]:
+        return tour(self.layout, self.endpoints)
+
 
 @dataclass
 class Plan:
@@ -120,6 +124,14 @@ class Plan:
     def files(self) -> list[Path]:
         """All the files to read, each once: known views, then probes by kind."""
         return list(dict.fromkeys(self.known + [file for probes in self.held.values() for file, _ in probes]))
+
+
+def tour(layout: Layout, endpoints: Sequence[int]) -> list[int]:
+    """The known views that a demonstration passes on its way between two `endpoints`, these included: in a studio
+    scene, where one side is not seen from the other, those between in file order; elsewhere no others."""
+    first, last = endpoints
+    step = 1 if last > first else -1
+    return [*range(first, last, step), last] if layout is Layout.studio else [first, last]
 
 
 def load(cfg: SceneConfig) -> Scene:

@@ -37,7 +37,7 @@ from viinter.callbacks import (
     ViewLogger,
 )
 from viinter.checkpoints import Interruption, SaveCheckpoint
-from viinter.codes import path, project
+from viinter.codes import along, project
 from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.data import SceneData
 from viinter.files import failure_noted, whole
@@ -293,7 +293,7 @@ def show(
     image.write(run_dir / "strip.png", strip.cpu())
     size, chunk, codes = (scene.height, scene.width), cfg.evaluation.chunk_pixels, module.codes.weight.detach()
     frames = errors.film_frames(cfg.logging.frames)  # a film with fewer of them takes as long to watch
-    film = path(codes, list(scene.endpoints), frames - 1)
+    film = along(codes, scene.tour, frames)
     fps = FPS * frames / cfg.logging.frames
     pictures.write_film(run_dir / "interpolation.mp4", module.field, film, size, chunk, fps)
     pictures.plot_error(run_dir / "error_vs_time.png", errors.rows, f"{scene.name}, model={cfg.model.name}")

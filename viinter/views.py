@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from viinter import metrics
-from viinter.codes import mix, path
+from viinter.codes import along, mix
 from viinter.config import UserError
 from viinter.scenes import Scene
 
@@ -57,8 +57,8 @@ def draw(field: nn.Module, z: Tensor, height: int, width: int, chunk_pixels: int
 
 def draw_strip(field: nn.Module, codes: Tensor, scene: Scene, chunk_pixels: int) -> Tensor:
     """`STRIP` frames side by side [H, STRIP * W, 3] in [0, 1], from one of the scene's endpoints to the other (as the
-    paper's Figure 5), under mixes of `codes` [n, M]."""
-    frames = path(codes, list(scene.endpoints), STRIP - 1)
+    paper's Figure 5; `scenes.tour`), under mixes of `codes` [n, M]."""
+    frames = along(codes, scene.tour, STRIP)
     return torch.cat([draw(field, z, scene.height, scene.width, chunk_pixels) for z in frames], 1).clamp(0, 1)
 
 
