@@ -104,6 +104,12 @@ def test_a_step_trains_one_chart_on_its_own_views_and_leaves_the_codes():
     assert sorted(map(id, field.parameters())) == sorted(id(p) for group in groups[:-1] for p in group["params"])
 
 
+@pytest.mark.parametrize(("texture_pixels", "side"), [(4 * 64**2, 64), (4 * 64**2 - 4, 32)])
+def test_the_textures_of_charts_are_smaller_from_a_quarter_of_the_pixels_on(texture_pixels, side):
+    field = make(4, 64, texture_pixels=texture_pixels, margin=1.0)
+    assert field.charts[0].colours[-1].shape[-2:] == (side, side)
+
+
 def test_enough_is_counted_for_each_chart():
     field = make(8)
     assert field.enough(0.1) == 8 * STEPS

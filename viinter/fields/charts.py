@@ -27,6 +27,7 @@ WINDOW = 3  # views in a chart: the fewest that overlap
 STEPS = 300  # of each chart, if `ENOUGH` passes over its views are not more
 PACE = Pace(coarsest=16, coarse=0.30, half=0.50, shift=0.2, bend=0.2)  # from view to view motion is far, and it turns
 HELD = 10.0  # times as much as a field of all views a chart is held to the known ones: few views leave more open
+MANY = 4  # times smaller than those of one field are a chart's textures at most, in pixels, since there are so many
 SHARP = 20.0  # how soon, on the way to a known view, a chart is left that lacks it
 LEAST = 1e-3  # of the first chart's weight: with less a chart is not drawn
 
@@ -36,12 +37,13 @@ class ChartedField(Field):
     `sets` is not used: charts that overlap are as many."""
 
     def __init__(
-        self, code_dim: int, views: int, height: int, width: int, window: int, sets: int, consistency: float,
-        **settings: Any,
+        self, code_dim: int, views: int, height: int, width: int, window: int, sets: int, texture_pixels: int,
+        consistency: float, **settings: Any,
     ) -> None:  # fmt: skip
         super().__init__()
         settings |= {"code_dim": code_dim, "views": window, "height": height, "width": width}
         settings |= {"sets": 1, "consistency": HELD * consistency, "pace": PACE}
+        settings["texture_pixels"] = max(1, texture_pixels // MANY)
         self.charts = nn.ModuleList(FastField(**settings) for _ in range(views))
         self.window, self.round, self.turn = window, 0, 0
         self.known: Tensor | None = None
