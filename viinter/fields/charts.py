@@ -41,10 +41,10 @@ class ChartedField(Field):
         consistency: float, **settings: Any,
     ) -> None:  # fmt: skip
         super().__init__()
-        settings |= {"code_dim": code_dim, "views": window, "height": height, "width": width}
-        settings |= {"sets": 1, "consistency": HELD * consistency, "pace": PACE}
-        settings["texture_pixels"] = max(1, texture_pixels // MANY)
-        self.charts = nn.ModuleList(FastField(**settings) for _ in range(views))
+        settings |= {"sets": 1, "texture_pixels": max(1, texture_pixels // MANY), "consistency": HELD * consistency}
+        self.charts = nn.ModuleList(
+            FastField(code_dim, window, height, width, pace=PACE, **settings) for _ in range(views)
+        )
         self.window, self.round, self.turn = window, 0, 0
         self.known: Tensor | None = None
         # of the known views in a code: z = sum_v share_v z_v, as nearly as that can be
@@ -94,7 +94,8 @@ class ChartedField(Field):
         own = (view + self.round) % self.window  # as evenly spread as `view` is, over some rounds
         known = (own + self.turn) % len(codes)
         x, y = torch.minimum(((xy + 1) / 2 * self.size).round(), self.size - 1).long().unbind(-1)
-        return self.charts[self.turn].loss(own, xy, self.known[known[:, None], y, x], self.around(codes)[self.turn])
+        around = codes.roll(-self.turn, 0)[: self.window]
+        return self.charts[self.turn].loss(own, xy, self.known[known[:, None], y, x], around)
 
     def finish(self, views: Tensor, codes: Tensor) -> None:
         for chart, *own in zip(self.charts, self.around(views), self.around(codes), strict=True):
@@ -115,10 +116,8 @@ class ChartedField(Field):
 
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
         """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped."""
-        rgb = 0
-        for chart, weight in zip(self.charts, self.weights(z).unbind(1), strict=True):
-            some = weight.nonzero()[:, 0]
-            if len(some):
-                own = weight[some, None, None] * chart(xy[some], z[some])
-                rgb = rgb + own.new_zeros(*xy.shape[:2], 3).index_add(0, some, own)
+        weights, rgb = self.weights(z), z.new_zeros(*xy.shape[:2], 3)
+        for k in weights.any(0).nonzero()[:, 0].tolist():
+            some = weights[:, k].nonzero()[:, 0]
+            rgb = rgb.index_add(0, some, weights[some, k, None, None] * self.charts[k](xy[some], z[some]))
         return rgb
