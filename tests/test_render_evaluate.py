@@ -1,5 +1,6 @@
 """A finished run drawn and measured again."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -153,6 +154,42 @@ def test_corners_give_a_sheet_of_mixes_and_a_film_round_them(run, tmp_path):
     ):  # fmt: skip
         part = sheet[32 * row : 32 * row + 32, 32 * column : 32 * column + 32]
         assert (part - expected.clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-5
+
+
+@pytest.mark.parametrize("kind", [FrameFormat.png, FrameFormat.exr])
+def test_an_interrupted_drawing_goes_on_in_its_folder_and_ends_the_same(bright_run, tmp_path, monkeypatch, kind):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    asked = RenderConfig(run=str(bright_run), path=[0, 2], frames=5, format=kind, out=str(parts))
+    render(dataclasses.replace(asked, out=str(whole)))
+    drawn = []
+
+    def interrupted(*values):
+        if len(drawn) == 2:
+            raise KeyboardInterrupt
+        drawn.append(1)
+        return draw(*values)
+
+    monkeypatch.setattr("viinter.render.draw", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=f"2 of 6 frames; the same command with out={re.escape(str(parts))}"):
+        render(asked)
+    assert len(frames(parts, kind.value)) == 2
+    drawn.clear()
+    monkeypatch.setattr("viinter.render.draw", lambda *values: drawn.append(1) or draw(*values))
+    render(asked)
+    assert len(drawn) == 4  # of six
+    assert {file.name for file in parts.iterdir()} == {file.name for file in whole.iterdir()}
+    for file in frames(whole, kind.value):  # their bytes hold the time
+        assert torch.equal(image.read(parts / file.name), image.read(file))
+    assert (parts / "interpolation.gif").read_bytes() == (whole / "interpolation.gif").read_bytes()
+
+
+def test_frames_of_another_drawing_in_the_folder_are_drawn_anew(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("viinter.video.write_mp4", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        render(RenderConfig(run=str(run), path=[0, 8], frames=1, out=str(tmp_path)))
+    monkeypatch.undo()
+    render(RenderConfig(run=str(run), path=[4, 8], frames=1, out=str(tmp_path)))
+    assert (image.read(frames(tmp_path)[0]) - known(run, 4).clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-6
 
 
 def test_a_square_of_mixes_has_its_corners_in_reading_order_and_a_circle_touches_its_sides():

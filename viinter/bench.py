@@ -30,8 +30,9 @@ from viinter.config import ConfigError, Layout, TrainConfig
 from viinter.data import PixelStore
 from viinter.evidence import TARGETS, seconds_to
 from viinter.fields.fast import reductions
+from viinter.files import write_json
 from viinter.module import ViewInterpolator
-from viinter.train import train, write_json
+from viinter.train import train
 
 ABOUT = """
 Times a training step through viinter.train against the same step in a bare PyTorch loop, in turns in one process, and

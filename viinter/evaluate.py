@@ -20,10 +20,11 @@ from viinter import command, config, metrics, scenes
 from viinter.codes import mix
 from viinter.config import ConfigError, EvaluateConfig, TrainConfig
 from viinter.data import PixelStore
+from viinter.files import write_json
 from viinter.module import ViewInterpolator, load, run_device
 from viinter.optical_flow import measure_registered
 from viinter.scenes import Probe
-from viinter.train import about, describe, write_json
+from viinter.train import about, describe
 from viinter.views import draw, measure
 
 GRADIENTS = 4  # times the memory of drawing a pixel, about, that a step of finetuning takes

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import traceback
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from viinter.config import UserError
 
@@ -32,6 +34,12 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it is gone already where all went well
             part.unlink()
+
+
+def write_json(path: str | os.PathLike, values: dict[str, Any]) -> None:
+    """Writes the file whole; NaN and infinity are refused (ValueError)."""
+    with whole(path) as part:
+        part.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
 @contextmanager

@@ -5,6 +5,7 @@ Notation: `M` the length of a code; a path is a row of codes [F, M], one for eac
 
 from __future__ import annotations
 
+import json
 import math
 from datetime import datetime
 from pathlib import Path
@@ -16,10 +17,13 @@ from rich.progress import track
 from torch import Tensor
 
 from viinter import codes, command, image, video
-from viinter.config import ConfigError, Easing, FrameFormat, RenderConfig
-from viinter.module import load, run_device
+from viinter.config import ConfigError, Easing, FrameFormat, RenderConfig, plain
+from viinter.files import write_json
+from viinter.module import checkpoint_file, load, run_device
 from viinter.scenes import tour
 from viinter.views import draw
+
+UNFINISHED = "unfinished.json"  # in the output folder until all is drawn: what is being drawn there
 
 ABOUT = """
 Draws the views between known views of a finished run. No images are needed, only the run folder.
@@ -28,17 +32,21 @@ Draws the views between known views of a finished run. No images are needed, onl
   python -m viinter.render run=RUN_DIR path=[0,4,24] easing=smooth loop=true
   python -m viinter.render run=RUN_DIR corners=[0,4,20,24]           mixes of four views: a sheet and a film
   python -m viinter.render run=RUN_DIR size=[1024,1024] format=exr   any size: the field is continuous
+  python -m viinter.render ... out=DIR                               goes on with one that was interrupted
 """
 
 
 def render(cfg: RenderConfig) -> dict[str, Any]:
     """Draws a path through known views, or the mixes of four, and writes frames, `interpolation.mp4` and `.gif`.
 
+    Frames that an interrupted drawing of the same left in `cfg.out` are taken as they are.
+
     Returns:
         `out` (folder), `frames`, `height`, `width`.
 
     Raises:
         UserError: no run folder, views that it does not have, sizes or counts that cannot be drawn.
+        KeyboardInterrupt: after Ctrl-C; its message says how to go on.
     """
     console = Console()
     if cfg.threads:
@@ -67,22 +75,43 @@ def render(cfg: RenderConfig) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     smooth = cfg.easing is Easing.smooth
     film = circle(book[views], cfg.frames) if cfg.corners else codes.path(book, views, cfg.frames, smooth, cfg.loop)
+    note, asked = out / UNFINISHED, drawing(cfg)
+    goes_on = note.is_file() and json.loads(note.read_text()) == asked
+    write_json(note, asked)
+    white = about["white"] if cfg.format is FrameFormat.exr else 1.0
     shown = []
-    for k, z in enumerate(track(film, "drawing", console=console)):
-        frame = draw(model.field, z, *size, cfg.chunk_pixels).cpu()
-        if cfg.format is FrameFormat.exr:
-            image.write(out / f"frame_{k:05d}.exr", frame * about["white"], bits=32)
-        elif cfg.format is FrameFormat.png:
-            image.write(out / f"frame_{k:05d}.png", frame.clamp(0, 1))
-        shown.append(frame.clamp(0, 1).mul(255).round().to(torch.uint8))
+    try:
+        for k, z in enumerate(track(film, "drawing", console=console)):
+            file = out / f"frame_{k:05d}.{cfg.format.value}"
+            if goes_on and file.is_file():
+                frame = image.read(file) / white
+            else:
+                frame = draw(model.field, z, *size, cfg.chunk_pixels).cpu()
+                if cfg.format is FrameFormat.exr:
+                    image.write(file, frame * white, bits=32)
+                elif cfg.format is FrameFormat.png:
+                    image.write(file, frame.clamp(0, 1))
+            shown.append(frame.clamp(0, 1).mul(255).round().to(torch.uint8))
+    except KeyboardInterrupt:
+        left = f"interrupted after {len(shown)} of {len(film)} frames; the same command with out={out} goes on"
+        raise KeyboardInterrupt(left if cfg.format is not FrameFormat.none else "") from None
     video.write_mp4(out / "interpolation.mp4", (f / 255 for f in shown), fps=cfg.fps)
     video.write_gif(out / "interpolation.gif", (f / 255 for f in shown), fps=min(cfg.fps, 25))
     if cfg.corners:
         rows = [torch.cat([draw(model.field, z, *size, cfg.chunk_pixels) for z in row], 1)
                 for row in square(book[views], cfg.side)]  # fmt: skip
         image.write(out / "sheet.png", torch.cat(rows).clamp(0, 1).cpu())
+    note.unlink()
     console.print(f"{len(film)} frames of {size[0]} x {size[1]}: {out}", highlight=False, soft_wrap=True)
     return {"out": str(out), "frames": len(film), "height": size[0], "width": size[1]}
+
+
+def drawing(cfg: RenderConfig) -> dict[str, Any]:
+    """What decides how the frames look: the settings that do, and which checkpoint it is."""
+    found = plain(cfg)
+    for key in ("out", "side", "fps", "accelerator", "threads", "chunk_pixels"):
+        del found[key]
+    return found | {"checkpoint": checkpoint_file(cfg.run).stat().st_mtime_ns}
 
 
 def bilinear(corners: Tensor, u: Tensor, v: Tensor) -> Tensor:

@@ -27,10 +27,11 @@ from rich.progress import track
 from viinter import command, config, memory, metrics, page, scenes, twin
 from viinter.callbacks import Budget
 from viinter.config import ConfigError, TrainConfig
+from viinter.files import write_json
 from viinter.guard import DivergenceError
 from viinter.module import ViewInterpolator
 from viinter.page import Picture, Section, Table
-from viinter.train import train, write_json
+from viinter.train import train
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

@@ -40,7 +40,7 @@ from viinter.checkpoints import Interruption, SaveCheckpoint
 from viinter.codes import along, project
 from viinter.config import ConfigError, TrainConfig, UserError
 from viinter.data import SceneData
-from viinter.files import failure_noted, whole
+from viinter.files import failure_noted, write_json
 from viinter.guard import DivergenceError, DivergenceGuard
 from viinter.metrics import SSIM_WINDOW
 from viinter.module import ViewInterpolator, checkpoint_file, read_checkpoint
@@ -316,12 +316,6 @@ def summary(metrics: dict[str, Any], run_dir: Path) -> str:
     shown = ("strip.png", "interpolation.mp4", "error_vs_time.png", "metrics.json")
     lines.append(f"{run_dir}: " + ", ".join(name for name in shown if (run_dir / name).exists()))
     return "\n".join(lines)
-
-
-def write_json(file: Path, values: dict[str, Any]) -> None:
-    """Writes the file whole; NaN and infinity are refused."""
-    with whole(file) as part:
-        part.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
 def main() -> None:
