@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from viinter.codes import lerp
 from viinter.fields import fast
-from viinter.fields.fast import FastField, best_shares, look_up
+from viinter.fields.fast import CONTRAST, FastField, best_shares, look_up, normalized
 from viinter.views import draw, pixel_grid
 
 M = 8
@@ -82,6 +82,22 @@ def test_looking_up_between_pixels_is_bilinear_and_ends_at_the_border(height, wi
             assert torch.allclose(colours, expected[0, :, 0].T, atol=1e-5)
 
 
+def disagreement(field: FastField, views: torch.Tensor, slide: float) -> torch.Tensor:
+    """That of the two `views` [2, 128, 128, 3] if all that is seen in the first is `slide` pixels to the left in the
+    second."""
+    codes = torch.nn.Parameter(torch.stack([torch.zeros(M), torch.eye(M)[0]]))
+    field.see(views)
+    rows = pixel_grid(128, 128).view(128, 128, 2)[::16]
+    view = torch.arange(8) // 4
+    with torch.no_grad():
+        field.shift.zero_()
+        field.bend.zero_()
+        field.disparity.zero_()
+        field.shift[:, 0, 0] = slide * 2 / 128
+    field(rows, codes[view])
+    return field.disagreement(view, views[view, 16 * torch.arange(8)], codes)
+
+
 @pytest.mark.parametrize(("progress", "texture_pixels"), [(0.0, 128**2), (0.2, 128**2), (1.0, 128**2), (1.0, 64**2)])
 def test_known_views_agree_where_the_motion_is_right_and_disagree_where_it_is_not(
     progress, texture_pixels, monkeypatch
@@ -89,29 +105,37 @@ def test_known_views_agree_where_the_motion_is_right_and_disagree_where_it_is_no
     """Two views of a smooth picture that slides by 8 pixels, at 32, 64, 128 and 64 of their 128 pixels."""
     monkeypatch.setattr(fast, "FEW", 1)  # textures are still empty
     field = make(128, 128, texture_pixels=texture_pixels)
-    codes = torch.nn.Parameter(torch.stack([torch.zeros(M), torch.eye(M)[0]]))
     wide = torch.sin(torch.arange(136) / 20)[:, None, None].expand(-1, 128, 3).transpose(0, 1) / 2 + 0.5
     views = torch.stack([wide[:, :128], wide[:, 8:]])  # a thing at x in the first is at x - 8 in the second
-    field.see(views)
     field.at(progress)
-    rows = pixel_grid(128, 128).view(128, 128, 2)[::16]
-    view = torch.arange(8) // 4
-
-    def disagreement(slide: float) -> torch.Tensor:
-        with torch.no_grad():
-            field.shift.zero_()
-            field.bend.zero_()
-            field.disparity.zero_()
-            field.shift[:, 0, 0] = slide * 2 / 128
-        field(rows, codes[view])
-        return field.disagreement(view, views[view, 16 * torch.arange(8)], codes)
-
-    right, still, wrong = (disagreement(slide) for slide in (8.0, 0.0, -8.0))
+    right, still, wrong = (disagreement(field, views, slide) for slide in (8.0, 0.0, -8.0))
     assert right < 0.02 * still
     assert still < wrong
-    still = disagreement(6.0)
+    still = disagreement(field, views, 6.0)
     still.backward()
     assert (field.shift.grad[:, 0, 0] < 0).all()  # more of it would be better
+
+
+def test_normalized_views_agree_under_another_light(monkeypatch):
+    """The picture slides by 8 pixels, and the second view of it has half the light, and the sun somewhere else."""
+    monkeypatch.setattr(fast, "FEW", 1)
+    coarse = torch.rand(1, 3, 32, 34, generator=torch.Generator().manual_seed(0))
+    wide = torch.nn.functional.interpolate(coarse, (128, 136), mode="bicubic")[0].movedim(0, -1)
+    shade = 0.3 * torch.linspace(0, 1, 128)[:, None, None] ** 2
+    views = torch.stack([wide[:, :128], 0.5 * wide[:, 8:] + shade])
+    right, still = (disagreement(make(128, 128, normalize=True), views, slide) for slide in (8.0, 0.0))
+    assert right < 0.05 * still
+    right, still = (disagreement(make(128, 128), views, slide) for slide in (8.0, 0.0))
+    assert right > 0.5 * still  # colours say little
+
+
+@given(st.floats(0.5, 2.0), st.floats(-1.0, 1.0), st.integers(0, 2**32 - 1))
+def test_normalized_colours_have_one_contrast_whatever_the_light(gain, offset, seed):
+    views = torch.rand(2, 9, 12, 3, generator=torch.Generator().manual_seed(seed))
+    found = normalized(views)
+    assert found.square().mean().sqrt().item() == pytest.approx(CONTRAST, rel=0.2)
+    assert (normalized(gain * views + offset) - found).square().mean().sqrt() < 0.1 * CONTRAST
+    assert normalized(torch.full((1, 5, 5, 3), offset)).abs().max() < 0.01 * CONTRAST  # nothing to be seen
 
 
 def test_between_two_views_a_colour_of_either_is_right_and_no_other():

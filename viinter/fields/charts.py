@@ -42,9 +42,8 @@ class ChartedField(Field):
     ) -> None:  # fmt: skip
         super().__init__()
         settings |= {"sets": 1, "texture_pixels": max(1, texture_pixels // MANY), "consistency": HELD * consistency}
-        self.charts = nn.ModuleList(
-            FastField(code_dim, window, height, width, pace=PACE, **settings) for _ in range(views)
-        )
+        settings |= {"pace": PACE, "normalize": True}  # a ring may be a turntable, whose light does not turn
+        self.charts = nn.ModuleList(FastField(code_dim, window, height, width, **settings) for _ in range(views))
         self.window, self.round, self.turn = window, 0, 0
         self.known: Tensor | None = None
         # of the known views in a code: z = sum_v share_v z_v, as nearly as that can be

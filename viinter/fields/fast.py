@@ -29,8 +29,9 @@ homography are the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al.
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
-takes it in a view nearby (as in Zhou et al. 2017, who learn depth so). Of few pictures a view between two is held to
-both in the same way, since nothing else says what there should be.
+takes it in a view nearby (as in Zhou et al. 2017, who learn depth so). On a turntable light and shade stay behind when
+the rest turns; there what is around each pixel is compared without its brightness and contrast. Of few pictures a view
+between two is held to both in the same way, since nothing else says what there should be.
 
 What the layers leave over of each known view (sharp detail, highlights that slide over a surface) is kept as that
 view's remainder, read where the motion takes it, and shared among the known views nearest in motion.
@@ -56,6 +57,8 @@ EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparit
 NEAREST = 8  # known views that share in a remainder
 COMPARED = 4  # one of so many rows of a batch is looked up in another known view
 PARTNERS = 4  # which is one of so many nearest in motion, in turns
+CONTRAST = 0.14  # rgb: the deviation of colours around a pixel that are `normalized`
+FAINT = 0.01  # rgb: deviations below this may be noise and stay smaller
 OCCLUDED = 0.05  # rgb: differences well above this count little, they may be another surface
 FEW = 4  # known views at most, if mixes of their codes are held to them too
 GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole parts, spread evenly (Weyl 1916)
@@ -85,21 +88,22 @@ class FastField(Field):
 
     Coarse to fine: colours and weights are sums of levels, each twice as fine as the one before. `at(progress)` chooses
     the level in training; those before it are kept as they are, those after it do not take part. A level's weights have
-    half the size of its colours; the finest level has none of its own and trains those of the level before. See
-    `config.FastModel` for the other arguments.
+    half the size of its colours; the finest level has none of its own and trains those of the level before.
+    `normalize`: known views are compared as they are `normalized`. See `config.FastModel` for the other arguments.
     """
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
                  margin: float, texture_pixels: int, sharpness: float, entropy: float, smooth: float,
-                 consistency: float, remainder: bool, pace: Pace = STEADY) -> None:  # fmt: skip
+                 consistency: float, remainder: bool, pace: Pace = STEADY,
+                 normalize: bool = False) -> None:  # fmt: skip
         super().__init__()
         self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
         self.drawn: tuple[Tensor, ...] = ()
         self.known: Tensor | None = None
-        self.maps: Tensor | None = None
+        self.maps: tuple[Tensor, Tensor] | None = None
         self.kept: dict[str, tuple[list, Tensor]] = {}
         self.margin, self.sharpness, self.motion, self.pace = margin, sharpness, motion, pace
-        self.entropy, self.smooth, self.consistency = entropy, smooth, consistency
+        self.entropy, self.smooth, self.consistency, self.normalize = entropy, smooth, consistency, normalize
         self.pitch = 2 / width
         self.shape, self.active = (sets, layers), sets
         layers *= sets  # those of a set one after the other
@@ -319,8 +323,10 @@ class FastField(Field):
             distances = torch.cdist(places.flatten(1), places.flatten(1)).fill_diagonal_(math.inf)
             near = distances.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
         partner = near[view, (self.step // COMPARED % near.shape[1])[None]]
-        there, inside = self.found(partner, places, xy, phi, place, seen)
-        own = rgb if self.reductions[self.level] == 1 else look_up(self._maps(), view, self._pixel(xy))
+        _, maps = self._maps()
+        there, inside = self.found(maps, partner, places, xy, phi, place, seen)
+        as_drawn = self.reductions[self.level] == 1 and not self.normalize
+        own = rgb if as_drawn else look_up(maps, view, self._pixel(xy))
         apart = (robust((there - own).square().mean(-1)) * inside).mean()
         return apart + self.between(view, partner, xy, phi, places) if len(codes) <= FEW else apart
 
@@ -331,22 +337,22 @@ class FastField(Field):
         share = (self.step * GOLDEN % 65_536 / 65_536).to(places.dtype)
         place = torch.lerp(places.index_select(0, view), places.index_select(0, partner), share)
         each, _, seen = self.each_set(xy, phi, place)
-        each, errors = each.movedim(1, -1) + 0.5, []
+        each, errors, (maps, _) = each.movedim(1, -1) + 0.5, [], self._maps()
         for known in (view, partner):
-            there, inside = self.found(known, places, xy, phi, place, seen)
+            there, inside = self.found(maps, known, places, xy, phi, place, seen)
             errors.append((there - each).square().mean(-1).masked_fill(~inside, math.inf))
         error = torch.minimum(*errors)
         return robust(error.masked_fill(error.isinf(), 0)).mean()
 
-    def found(self, known: Tensor, places: Tensor, xy: Tensor, phi: Tensor, place: Tensor,
+    def found(self, maps: Tensor, known: Tensor, places: Tensor, xy: Tensor, phi: Tensor, place: Tensor,
               seen: Tensor) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Colours [S, V, P, 3] that the known views number `known` [V] of those at `places` [n, S, 4 K + 2] have where
-        the motion takes the pixels `xy` [V, 2, P] of views at `place` [V, S, 4 K + 2] with what is `seen` [S, 2, V, P]
-        there; and whether that is inside the view [S, V, P]."""
+        """What [S, V, P, 3] the known views number `known` [V] of those at `places` [n, S, 4 K + 2], one of `_maps`,
+        have where the motion takes the pixels `xy` [V, 2, P] of views at `place` [V, S, 4 K + 2] with what is `seen`
+        [S, 2, V, P] there; and whether that is inside the view [S, V, P]."""
         a, b, c = self.carry(phi, place - places.index_select(0, known))
         disparity, drift = seen[..., None, :].unbind(1)
         moved = self.margin * torch.addcmul(torch.addcmul(a, disparity, b), drift, c)  # [S, V, 2, P]
-        maps, there = self._maps(), self._pixel(xy + moved)
+        there = self._pixel(xy + moved)
         x, y = there.unbind(2)
         inside = (x >= 0) & (x <= maps.shape[2] - 1) & (y >= 0) & (y <= maps.shape[1] - 1)
         return look_up(maps, known, there), inside
@@ -355,11 +361,13 @@ class FastField(Field):
         """Where `xy` [..., 2, P] lies in the known views at the size of the level, counted in their pixels."""
         return ((xy + 1) * self.size / 2 + 0.5) / self.reductions[self.level] - 0.5
 
-    def _maps(self) -> Tensor:
-        """The known views [n, h, w, 3] at the size of the level in training, the same memory until that changes."""
+    def _maps(self) -> tuple[Tensor, Tensor]:
+        """The known views [n, h, w, 3] at the size of the level in training, and what of them is compared; the same
+        memory until the level changes."""
         if self.maps is None:
             by, maps = self.reductions[self.level], self.known.to(self.shift.dtype)
-            self.maps = F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
+            maps = F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
+            self.maps = maps, normalized(maps) if self.normalize else maps
         return self.maps
 
     def loss(self, view: Tensor, xy: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
@@ -524,6 +532,21 @@ def robust(error: Tensor) -> Tensor:
     """Half of a squared difference of colours while it is small, and less of a large one, which may be that to another
     surface (Charbonnier et al. 1994)."""
     return OCCLUDED * ((error + OCCLUDED**2).sqrt() - OCCLUDED)
+
+
+def normalized(views: Tensor) -> Tensor:
+    """Colours [n, h, w, 3] less their mean around each pixel, over their deviation there, scaled to `CONTRAST`: light
+    that changes from view to view leaves them as they are (as in Zhang et al. 2018, who so compare stereo pictures)."""
+
+    def around(maps: Tensor) -> Tensor:
+        for _ in range(2):
+            maps = F.avg_pool2d(maps, 3, 1, 1, count_include_pad=False)
+        return maps
+
+    maps = views.movedim(-1, 1)
+    maps = maps - around(maps)
+    deviation = around(maps.square().mean(1, keepdim=True)).sqrt()
+    return (CONTRAST * maps / (deviation + FAINT)).movedim(1, -1).contiguous()
 
 
 def look_up(views: Tensor, which: Tensor, at: Tensor) -> Tensor:
