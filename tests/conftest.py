@@ -327,9 +327,9 @@ def random_codes(count: int, code_dim: int) -> torch.nn.Parameter:
     return torch.nn.Parameter(codes / codes.abs().sum(-1, keepdim=True))
 
 
-def blobs(height: int, width: int, seed: int) -> torch.Tensor:
-    """A smooth random picture [3, H, W], 16 pixels from blob to blob."""
-    coarse = torch.rand(1, 3, height // 16, width // 16, generator=torch.Generator().manual_seed(seed))
+def blobs(height: int, width: int, seed: int, apart: int = 16) -> torch.Tensor:
+    """A smooth random picture [3, H, W], `apart` pixels from blob to blob."""
+    coarse = torch.rand(1, 3, height // apart, width // apart, generator=torch.Generator().manual_seed(seed))
     return torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic")[0].clamp(0, 1)
 
 

@@ -158,8 +158,10 @@ def test_corners_give_a_sheet_of_mixes_and_a_film_round_them(run, tmp_path):
 
 @pytest.mark.parametrize("kind", [FrameFormat.png, FrameFormat.exr])
 def test_an_interrupted_drawing_goes_on_in_its_folder_and_ends_the_same(bright_run, tmp_path, monkeypatch, kind):
+    """Where another was drawn before: of that nothing is left."""
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     asked = RenderConfig(run=str(bright_run), path=[0, 2], frames=5, format=kind, out=str(parts))
+    render(dataclasses.replace(asked, path=[2, 0]))
     render(dataclasses.replace(asked, out=str(whole)))
     drawn = []
 

@@ -76,14 +76,16 @@ def render(cfg: RenderConfig) -> dict[str, Any]:
     smooth = cfg.easing is Easing.smooth
     film = circle(book[views], cfg.frames) if cfg.corners else codes.path(book, views, cfg.frames, smooth, cfg.loop)
     note, asked = out / UNFINISHED, drawing(cfg)
-    goes_on = note.is_file() and json.loads(note.read_text()) == asked
-    write_json(note, asked)
+    files = [out / f"frame_{k:05d}.{cfg.format.value}" for k in range(len(film))]
+    if not note.is_file() or json.loads(note.read_text()) != asked:
+        for file in files:  # another drawing's, which must not be taken for this one's
+            file.unlink(missing_ok=True)
+        write_json(note, asked)
     white = about["white"] if cfg.format is FrameFormat.exr else 1.0
     shown = []
     try:
-        for k, z in enumerate(track(film, "drawing", console=console)):
-            file = out / f"frame_{k:05d}.{cfg.format.value}"
-            if goes_on and file.is_file():
+        for file, z in zip(files, track(film, "drawing", console=console), strict=True):
+            if file.is_file():
                 frame = image.read(file) / white
             else:
                 frame = draw(model.field, z, *size, cfg.chunk_pixels).cpu()
