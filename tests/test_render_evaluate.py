@@ -308,6 +308,51 @@ def test_without_finetune_steps_there_are_no_finetuned_codes(run, tmp_path):
     assert found["novel"]["psnr"] is not None
 
 
+def test_an_interrupted_evaluation_goes_on_and_ends_the_same(run, tmp_path, monkeypatch):
+    shutil.copytree(run, tmp_path / "run")
+    asked = EvaluateConfig(run=str(tmp_path / "run"), finetune_steps=3, finetune_pixels=512, chunk_pixels=4096)
+    whole = evaluate(asked)
+    (tmp_path / "run" / "evaluation.json").unlink()
+    drawn = []
+
+    def interrupted(*values):
+        if len(drawn) == 5:  # two probes at a time
+            raise KeyboardInterrupt
+        drawn.append(1)
+        return draw(*values)
+
+    monkeypatch.setattr("viinter.evaluate.draw", interrupted)
+    count = len(whole["finetuned"]["per_view"])
+    with pytest.raises(KeyboardInterrupt, match=f"with 4 of {count} codes finetuned; the same command goes on"):
+        evaluate(asked)
+    assert not (tmp_path / "run" / "evaluation.json").exists()
+    drawn.clear()
+    monkeypatch.setattr("viinter.evaluate.draw", lambda *values: drawn.append(1) or draw(*values))
+    monkeypatch.setattr("viinter.evaluate.measure", lambda *_: 1 / 0)
+    assert evaluate(asked) == whole
+    assert len(drawn) == count - 4
+    monkeypatch.undo()
+    assert {file.name for file in (tmp_path / "run").iterdir()} == {file.name for file in run.iterdir()} | {
+        "evaluation.json"
+    }
+
+
+@pytest.mark.parametrize("change", ["settings", "checkpoint"])
+def test_what_another_evaluation_left_is_not_taken(run, tmp_path, monkeypatch, change):
+    shutil.copytree(run, tmp_path / "run")
+    asked = EvaluateConfig(run=str(tmp_path / "run"), finetune_steps=2, finetune_pixels=64)
+    monkeypatch.setattr("viinter.evaluate.finetune", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        evaluate(asked)
+    if change == "settings":
+        asked.finetune_lr = 0.1
+    else:
+        (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
+    monkeypatch.setattr("viinter.evaluate.measured", lambda *_: {}["measured anew"])
+    with pytest.raises(KeyError, match="measured anew"):
+        evaluate(asked)
+
+
 def test_a_scene_without_probes_is_evaluated_on_its_known_views(make_config, tmp_path):
     cfg = make_config("pair", **{"optim.steps": 2})
     train(cfg, tmp_path)

@@ -6,7 +6,10 @@ own image while the field stays as it is (paper Table 3): how much of the error 
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +24,14 @@ from viinter.codes import mix
 from viinter.config import ConfigError, EvaluateConfig, TrainConfig
 from viinter.data import PixelStore
 from viinter.files import write_json
-from viinter.module import ViewInterpolator, load, run_device
+from viinter.metrics import ViewError
+from viinter.module import ViewInterpolator, asked, load, run_device
 from viinter.optical_flow import measure_registered
-from viinter.scenes import Probe
+from viinter.scenes import Probe, Scene
 from viinter.train import about, describe
 from viinter.views import draw, measure
 
+UNFINISHED = "evaluation.unfinished.json"  # in the run folder until all is measured: what has been, and as what
 GRADIENTS = 4  # times the memory of drawing a pixel, about, that a step of finetuning takes
 
 ABOUT = """
@@ -36,11 +41,15 @@ is first moved onto the photograph, so that what it shows counts and not where. 
 
   python -m viinter.evaluate run=outputs/demo/paper/DATE_TIME
   python -m viinter.evaluate run=... finetune_steps=0                without finetuned codes
+
+The same command goes on with one that was interrupted.
 """
 
 
 def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
     """Measures the run folder `cfg.run` and writes `evaluation.json` there.
+
+    What an interrupted call with the same settings has measured is taken from `evaluation.unfinished.json`.
 
     Returns:
         `known`, `novel`, ... as in `metrics.json`; for the standard probes also `finetuned` and, with OpenCV,
@@ -48,6 +57,7 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
 
     Raises:
         UserError: no run folder, or the scene's images are not those it was trained on.
+        KeyboardInterrupt: after Ctrl-C; its message says what was kept.
     """
     console = Console()
     if cfg.threads:
@@ -59,6 +69,46 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
         raise ConfigError(f"{trained.scene.root} no longer holds the known views that {cfg.run} was trained on")
     console.print(describe(scene))
     codes = model.codes.weight.detach()
+    note = Path(cfg.run) / UNFINISHED
+    held: dict[str, Any] = {"asked": asked(cfg, ["run", "data", "accelerator", "threads"]), "finetuned": {}}
+    if note.is_file() and (older := json.loads(note.read_text()))["asked"] == held["asked"]:
+        held = older
+    probes = scene.probes["novel"] if cfg.finetune_steps else []
+    try:
+        if "found" not in held:
+            held["found"] = measured(model, trained, scene, cfg.chunk_pixels, console)
+            write_json(note, held)
+        left = [probe for probe in probes if probe.name not in held["finetuned"]]
+        for group, found_codes in finetune(model.field, codes, left, cfg, console):
+            errors = {}
+            for probe, z in zip(group, found_codes, strict=True):
+                with as_trained(model, trained):
+                    image = draw(model.field, z, scene.height, scene.width, cfg.chunk_pixels)
+                errors[probe.name] = asdict(metrics.compare(image, probe.target.to(image.device)))
+            held["finetuned"] |= errors
+            write_json(note, held)
+    except KeyboardInterrupt:
+        if "found" not in held:
+            raise
+        done = f"interrupted with {len(held['finetuned'])} of {len(probes)} codes finetuned"
+        raise KeyboardInterrupt(f"{done}; the same command goes on") from None
+    found: dict[str, Any] = held["found"]
+    if probes:
+        found["finetuned"] = metrics.summary({name: ViewError(**e) for name, e in held["finetuned"].items()})
+    write_json(Path(cfg.run) / "evaluation.json", found)
+    note.unlink()
+    for kind, values in found.items():
+        shown = [f"{values[k]:.{d}f} {unit}" for k, d, unit in (("psnr", 2, "dB"), ("ssim", 4, "SSIM"))
+                 if values[k] is not None]  # fmt: skip
+        console.print(f"{kind:16} {len(values['per_view']):4} views  {'  '.join(shown)}", highlight=False)
+    console.print(f"written: {Path(cfg.run) / 'evaluation.json'}", highlight=False, soft_wrap=True)
+    return found
+
+
+def measured(
+    model: ViewInterpolator, trained: TrainConfig, scene: Scene, chunk_pixels: int, console: Console
+) -> dict[str, Any]:
+    """`views.measure` of all known views and probes, and the standard probes `registered` where there is OpenCV."""
     drawn = {}
     with console.status("measuring every view") as status:
 
@@ -68,7 +118,7 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
                 drawn[scene.probes[kind][k].name] = image.cpu(), target.cpu()
 
         with as_trained(model, trained):
-            found: dict[str, Any] = measure(model.field, codes, scene, None, cfg.chunk_pixels, seen)
+            found: dict[str, Any] = measure(model.field, model.codes.weight.detach(), scene, None, chunk_pixels, seen)
         if drawn:
             status.update("registering the probes")
             registered = measure_registered(drawn)
@@ -77,19 +127,6 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
                 console.print(why, highlight=False, markup=False, soft_wrap=True)
             else:
                 found["registered"] = registered
-    if cfg.finetune_steps and scene.probes["novel"]:
-        errors, probes = {}, scene.probes["novel"]
-        for probe, z in zip(probes, finetune(model.field, codes, probes, cfg, console), strict=True):
-            with as_trained(model, trained):
-                image = draw(model.field, z, scene.height, scene.width, cfg.chunk_pixels)
-            errors[probe.name] = metrics.compare(image, probe.target.to(image.device))
-        found["finetuned"] = metrics.summary(errors)
-    write_json(Path(cfg.run) / "evaluation.json", found)
-    for kind, values in found.items():
-        shown = [f"{values[k]:.{d}f} {unit}" for k, d, unit in (("psnr", 2, "dB"), ("ssim", 4, "SSIM"))
-                 if values[k] is not None]  # fmt: skip
-        console.print(f"{kind:16} {len(values['per_view']):4} views  {'  '.join(shown)}", highlight=False)
-    console.print(f"written: {Path(cfg.run) / 'evaluation.json'}", highlight=False, soft_wrap=True)
     return found
 
 
@@ -102,14 +139,16 @@ def as_trained(model: ViewInterpolator, trained: TrainConfig) -> torch.autocast:
 
 def finetune(
     field: nn.Module, codes: Tensor, probes: list[Probe], cfg: EvaluateConfig, console: Console
-) -> Tensor:
-    """The codes [n, M] that show the targets of n probes best, found by Adam from their mixes; `field` is not touched.
+) -> Iterator[tuple[list[Probe], Tensor]]:
+    """The codes that show the targets of `probes` best, found by Adam from their mixes; `field` is not touched.
 
     A code is not held on the sphere: a mix lies inside it. Its step is measured against the code book's own scale,
     which the norm's order changes by orders of magnitude, and falls to zero along a cosine. Several probes take their
     steps side by side, as many as `cfg.chunk_pixels` allows; none knows of the others.
+
+    Yields:
+        n of the probes, until all have been, and their codes [n, M].
     """
-    found = []
     first = cfg.finetune_lr * codes.square().mean().sqrt().item()
     many = max(1, cfg.chunk_pixels // (GRADIENTS * cfg.finetune_pixels))
     groups = [probes[k : k + many] for k in range(0, len(probes), many)]
@@ -128,8 +167,7 @@ def finetune(
                 (z.grad,) = torch.autograd.grad(loss, [z])
                 optimizer.step()
                 progress.advance(task)
-            found.append(z.detach())
-    return torch.cat(found)
+            yield group, z.detach()
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pickle
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from viinter.codes import CodeBook
-from viinter.config import ConfigError, Layout, TrainConfig, from_plain, norm_order, plain
+from viinter.config import ConfigError, EvaluateConfig, Layout, RenderConfig, TrainConfig, from_plain, norm_order, plain
 from viinter.data import PixelBatch
 from viinter.fields.charts import WINDOW, ChartedField
 from viinter.fields.fast import FastField
@@ -97,6 +98,13 @@ def checkpoint_file(run: str | Path) -> Path | None:
     """
     files = [Path(run) / "checkpoints" / name for name in ("last.ckpt", "previous.ckpt")]
     return next((file for file in files if file.is_file()), None)
+
+
+def asked(cfg: RenderConfig | EvaluateConfig, apart: Sequence[str]) -> dict[str, Any]:
+    """What decides the outcome of a command on the finished run `cfg.run`: its settings but those in `apart`, and
+    which checkpoint it is."""
+    settings = {key: value for key, value in plain(cfg).items() if key not in apart}
+    return settings | {"checkpoint": checkpoint_file(cfg.run).stat().st_mtime_ns}
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from rich.progress import track
 from torch import Tensor
 
 from viinter import codes, command, image, video
-from viinter.config import ConfigError, Easing, FrameFormat, RenderConfig, plain
+from viinter.config import ConfigError, Easing, FrameFormat, RenderConfig
 from viinter.files import write_json
-from viinter.module import checkpoint_file, load, run_device
+from viinter.module import asked, load, run_device
 from viinter.scenes import tour
 from viinter.views import draw
 
@@ -75,12 +75,13 @@ def render(cfg: RenderConfig) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     smooth = cfg.easing is Easing.smooth
     film = circle(book[views], cfg.frames) if cfg.corners else codes.path(book, views, cfg.frames, smooth, cfg.loop)
-    note, asked = out / UNFINISHED, drawing(cfg)
+    note = out / UNFINISHED
+    drawing = asked(cfg, ["out", "side", "fps", "accelerator", "threads", "chunk_pixels"])  # what makes the frames
     files = [out / f"frame_{k:05d}.{cfg.format.value}" for k in range(len(film))]
-    if not note.is_file() or json.loads(note.read_text()) != asked:
+    if not note.is_file() or json.loads(note.read_text()) != drawing:
         for file in files:  # another drawing's, which must not be taken for this one's
             file.unlink(missing_ok=True)
-        write_json(note, asked)
+        write_json(note, drawing)
     white = about["white"] if cfg.format is FrameFormat.exr else 1.0
     shown = []
     try:
@@ -106,14 +107,6 @@ def render(cfg: RenderConfig) -> dict[str, Any]:
     note.unlink()
     console.print(f"{len(film)} frames of {size[0]} x {size[1]}: {out}", highlight=False, soft_wrap=True)
     return {"out": str(out), "frames": len(film), "height": size[0], "width": size[1]}
-
-
-def drawing(cfg: RenderConfig) -> dict[str, Any]:
-    """What decides how the frames look: the settings that do, and which checkpoint it is."""
-    found = plain(cfg)
-    for key in ("out", "side", "fps", "accelerator", "threads", "chunk_pixels"):
-        del found[key]
-    return found | {"checkpoint": checkpoint_file(cfg.run).stat().st_mtime_ns}
 
 
 def bilinear(corners: Tensor, u: Tensor, v: Tensor) -> Tensor:
