@@ -4,6 +4,7 @@ import copy
 import csv
 import itertools
 import math
+import re
 from types import SimpleNamespace
 
 import lightning as L
@@ -11,7 +12,7 @@ import pytest
 import torch
 from conftest import WITH_TOWER, checkpoint_of
 
-from viinter import callbacks, checkpoints, features, pictures, scenes
+from viinter import callbacks, checkpoints, features, metrics, pictures, scenes
 from viinter.callbacks import Budget, Clock, ErrorClock, InterpolationLoss, RenormalizeCodes, ViewLogger
 from viinter.checkpoints import Interruption, SaveCheckpoint
 from viinter.config import InterpolationConfig, OptimConfig, Patches
@@ -549,6 +550,26 @@ def test_rows_of_before_an_interruption_stay_in_the_table(make_config, tmp_path)
     assert [int(row["step"]) for row in table] == [1, 2, 3, 4, 5, 6]
     for key in ("training_seconds", "wall_seconds"):
         assert all(float(a[key]) < float(b[key]) for a, b in itertools.pairwise(table))
+
+
+def test_known_views_that_get_worse_by_half_are_warned_of_once(make_config, tmp_path, stopwatch, monkeypatch, caplog):
+    errors = iter([0.04, 0.01, 0.019, 0.021, 0.05, 0.015, 0.1, 0.1])
+    known = []
+
+    def measured(field, codes, scene, kinds, *_):
+        if "known" in kinds:
+            known.append(next(errors))
+        error = metrics.ViewError(known[-1], metrics.psnr(known[-1]), None)
+        return {kind: metrics.summary({"a view": error}) for kind in kinds}
+
+    monkeypatch.setattr(callbacks, "measure", measured)
+    often = {"evaluation.first_seconds": 0.25, "evaluation.factor": 1.0001, "evaluation.max_share": 1e9}
+    train(make_config(**{**often, "optim.steps": 8, "optim.lr": 1e-3}), tmp_path)
+    assert not list(errors)
+    said = [r.message for r in caplog.records if r.name == "viinter"]
+    assert [re.findall(r"at step (\d)", message) for message in said] == [["2", "4"], ["2", "7"]]
+    assert said[0].startswith("the known views had 20.0 dB at step 2 and have 16.8 at step 4: what was learned")
+    assert re.search(r"a lower optim.lr \(now [\d.e-]+\) may help$", said[0])
 
 
 def test_a_scene_without_probes_has_empty_novel_columns(make_config, tmp_path):

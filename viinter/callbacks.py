@@ -11,6 +11,7 @@ the codes are on the sphere whenever a pixel step reads them), then what only lo
 from __future__ import annotations
 
 import csv
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -34,11 +35,15 @@ from viinter.scenes import Scene
 from viinter.views import STRIP, draw, draw_strip, measure, pixel_grid
 
 LAST_SECONDS = 30.0  # that the last measurement may take however short a run was
+LOST = 2.0  # times the least error of the known views so far: from there on what was learned is being lost
 
 CSV_COLUMNS = [
     "step", "training_seconds", "wall_seconds", "known_mse", "known_psnr", "known_ssim", "novel_mse", "novel_psnr",
     "novel_ssim", "code_norm_min", "code_norm_max", "lr",
 ]  # fmt: skip
+
+
+log = logging.getLogger("viinter")
 
 
 class Clock:
@@ -257,6 +262,9 @@ class ErrorClock(L.Callback):
     none if all of them together would take more than half of `max_share` of the training seconds. The clock stands
     still meanwhile. Each gives a row of `error_vs_time.csv` and scalars in TensorBoard.
 
+    A measurement after which the known views have twice their least error is warned of: too high a rate takes a sine
+    network back to one flat colour, with every number finite.
+
     One comes at the end always. Where a view takes so long to draw that it would take more than is left of
     `max_share`, and more than `LAST_SECONDS`, only one of `every[kind]` views of each kind, evenly spaced, is measured
     then (`viinter.evaluate` measures all of them); so too for the probes beyond the standard ones, and `film_frames`.
@@ -341,9 +349,21 @@ class ErrorClock(L.Callback):
             row["lr"] = trainer.optimizers[0].param_groups[0]["lr"]
             self.rows.append(row)
             self._write(trainer.logger.experiment, row)
+            self._warn_of_loss(trainer)
             took = time.perf_counter() - begin
             self.spent, self.longest = self.spent + took, max(self.longest, took)
         return found
+
+    def _warn_of_loss(self, trainer: L.Trainer) -> None:
+        *before, now = self.rows
+        if before and trainer.is_global_zero:
+            best = min(before, key=lambda row: row["known_mse"])
+            if before[-1]["known_mse"] <= LOST * best["known_mse"] < now["known_mse"]:
+                log.warning(
+                    "the known views had %.1f dB at step %d and have %.1f at step %d: what was learned is being lost; "
+                    "a lower optim.lr (now %g) may help",
+                    best["known_psnr"] or math.inf, best["step"], now["known_psnr"], now["step"], now["lr"],
+                )  # fmt: skip
 
     def _seen(self, kind: str, index: int, image: Tensor, target: Tensor) -> None:
         for listener in self.listeners:
