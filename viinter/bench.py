@@ -238,7 +238,7 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     where = [f"scene.root={cfg.scene.root}", f"scene.downsample={cfg.scene.downsample}"]
     asked = [*typed(), *where, "evaluation.first_seconds=1"]
     found = {}
-    for name, own in races.methods(cfg.optim.training_seconds, cfg.scene.layout).items():
+    for name, own in races.methods(cfg.optim.training_seconds).items():
         Console().rule(name)
         found[name] = races.train(folder / re.sub(r"\W+", "_", name), own, asked)
     probed = [kind for kind in ("novel", "novel_posed") if scene.probes.get(kind)]
@@ -247,7 +247,8 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
          *(f"{r.value(kind, 'psnr'):.2f}" for kind in probed), *(reached(seconds_to(r, target)) for target in TARGETS)]
         for name, r in found.items()
     ]  # fmt: skip
-    untrained = {k: f["psnr"] for k, f in peers.measure(scene).items() if not isinstance(f, str)}
+    with Console().status("cross-fade and optical flow at the probes"):
+        untrained = {k: f["psnr"] for k, f in peers.measure(scene).items() if not isinstance(f, str)}
     rows += [[f"{name}, no training", "", "", "", f"{psnr:.2f}", *("" for _ in [*probed[1:], *TARGETS])]
              for name, psnr in untrained.items()]  # fmt: skip
     columns = ["", "steps", "training s", "known", *probed, *(f"s to {target} dB" for target in TARGETS)]

@@ -119,7 +119,8 @@ def untrained(of: list[Run]) -> dict[str, dict[str, Any]]:
             name = f"{run.metrics['scene']}, {run.metrics['width']} x {run.metrics['height']}"
             if name not in found:
                 try:
-                    found[name] = peers.measure(scenes.load(config.from_plain(run.metrics["settings"]).scene))
+                    with Console().status(f"{name}: cross-fade and optical flow at the probes"):
+                        found[name] = peers.measure(scenes.load(config.from_plain(run.metrics["settings"]).scene))
                 except UserError as error:
                     found[name] = dict.fromkeys(peers.PEERS, str(error))
     return found
