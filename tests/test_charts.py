@@ -1,9 +1,11 @@
 """Fast fields around a ring: which charts a code is drawn by, how they are trained, and a small ring that turns."""
 
+import copy
 import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 from conftest import WITH_TOWER, Crash, CrashAt, blobs, decibel, fit, random_codes, same, trained, without_times
 from hypothesis import given
 from hypothesis import strategies as st
@@ -114,7 +116,7 @@ def test_enough_is_counted_for_each_chart():
     field = make(8)
     assert field.enough(0.1) == 8 * STEPS
     assert field.enough(1000.0) == ENOUGH[1] * 3 * 1000
-    assert field.settle(100.0, 8, 1.0, lambda: 0.1) == pytest.approx(8 * 0.1 * 9 / 8)
+    assert field.settle(100.0, 8, 1.0, lambda: 0.1) == pytest.approx(8 * 0.1 * 17 / 8)
 
 
 @pytest.mark.parametrize(
@@ -153,24 +155,53 @@ def test_the_interpolation_step_draws_mixes_that_no_chart_holds(make_config, fak
     assert found["novel"] != alone["novel"]
 
 
-def test_a_ring_that_turns_is_learned_and_its_unseen_views_are_drawn_not_cross_faded():
-    """A pillar with a picture around it turns about in 12 views; half of it is seen in each."""
-    n, size, around = 12, 64, blobs(64, 128, 0).repeat(1, 1, 2)[..., :192]
+def pillar(k: float, n: int, size: int) -> torch.Tensor:
+    """View [size, size, 3] number k of n around a pillar with a picture around it; half of it is seen in each."""
+    around = blobs(64, 128, 0).repeat(1, 1, 2)[..., :192]
+    turn = (torch.asin(torch.linspace(-0.999, 0.999, size)) / (2 * math.pi) + k / n) % 1
+    x, y = torch.meshgrid(turn * 128 * 2 / 191 - 1, torch.linspace(-1, 1, size), indexing="xy")
+    return F.grid_sample(around[None], torch.stack([x, y], -1)[None], align_corners=True)[0].movedim(0, -1)
 
-    def view(k: float) -> torch.Tensor:
-        turn = (torch.asin(torch.linspace(-0.999, 0.999, size)) / (2 * math.pi) + k / n) % 1
-        x, y = torch.meshgrid(turn * 128 * 2 / 191 - 1, torch.linspace(-1, 1, size), indexing="xy")
-        grid = torch.stack([x, y], -1)
-        return torch.nn.functional.grid_sample(around[None], grid[None], align_corners=True)[0].movedim(0, -1)
 
-    codes, views = random_codes(n, M), torch.stack([view(k) for k in range(n)])
-    field = make(n, size)
-    fit(field, views, codes, steps=60 * n)
+@pytest.fixture(scope="module")
+def ring():
+    """A field that has learned 12 views of the pillar, 64 x 64; the views, and their codes."""
+    codes, views = random_codes(12, M), torch.stack([pillar(k, 12, 64) for k in range(12)])
+    field = make(12, 64)
+    fit(field, views, codes, steps=60 * 12)
+    return field, views, codes.detach()
+
+
+def test_a_ring_that_turns_is_learned_and_its_unseen_views_are_drawn_not_cross_faded(ring):
+    field, views, codes = ring
     gain = []
-    for k in range(n):
-        following = (k + 1) % n
-        drawn = draw(field, lerp(codes[k], codes[following], 0.5).detach(), size, size)
-        cross_fade = (views[k] + views[following]) / 2
-        gain.append(decibel(drawn, view(k + 0.5)) - decibel(cross_fade, view(k + 0.5)))
+    for k in range(12):
+        following, true = (k + 1) % 12, pillar(k + 0.5, 12, 64)
+        drawn = draw(field, lerp(codes[k], codes[following], 0.5), 64, 64)
+        gain.append(decibel(drawn, true) - decibel((views[k] + views[following]) / 2, true))
     assert min(gain) > 0.5
-    assert sum(gain) / n > 2
+    assert sum(gain) / 12 > 2
+
+
+def test_of_charts_that_overlap_one_whose_motion_is_wrong_counts_little(ring):
+    field, views, codes = copy.deepcopy(ring[0]), *ring[1:]
+    z, true = lerp(codes[3], codes[4], 0.5), pillar(3.5, 12, 64)
+    right, wrong = field.charts[2], field.charts[3]  # both hold views 3 and 4
+    with torch.no_grad():
+        wrong.shift.neg_()
+    field.finish(views, codes)
+    drawn, alone, other = (decibel(draw(each, z, 64, 64), true) for each in (field, right, wrong))
+    mean = decibel((draw(right, z, 64, 64) + draw(wrong, z, 64, 64)) / 2, true)
+    assert other < alone - 3
+    assert drawn > mean + 1
+    assert torch.allclose(draw(field, codes[4], 64, 64), views[4], atol=2e-3)
+
+
+def test_how_far_known_views_are_from_those_beside_them_is_kept():
+    """Of one colour each, motion does not matter; a row has two ends."""
+    field, codes = calibrated(4, consistency=0.0)
+    levels = torch.tensor([0.1, 0.2, 0.5, 0.9])
+    field.finish(levels[:, None, None, None].expand(4, 32, 32, 3), codes)
+    first = field.charts[0].remainder[:, 3].float()  # views 0, 1 and 2
+    expected = torch.tensor([0.01, (0.01 + 0.09) / 2, 0.09]).sqrt()
+    assert torch.allclose(first, expected[:, None, None].expand_as(first), atol=1e-3)

@@ -7,7 +7,8 @@ around the ring.
 A motion that is linear in the code is the motion of neighbours, and a few layers hold one side of what the cameras go
 around. So views that see the same side share a chart, as regions do in an atlas. A code is drawn by the charts that
 hold the known views nearest to it, and their mean is what is seen: between two known views that of m - 1 charts, which
-were learned apart from each other, so that it takes the place of the sets of one field for all views.
+were learned apart from each other, so that it takes the place of the sets of one field for all views. At each pixel a
+chart counts by how well known views agree where its motion takes them: one may have found a wrong motion there.
 
 The codes stay as they were drawn at random. They say which view is meant; where a chart has it, its motion learns.
 """
@@ -20,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from viinter.fields.fast import ENOUGH, JUDGED, FastField, Pace
+from viinter.fields.fast import ENOUGH, FAINT, JUDGED, FastField, Pace
 from viinter.fields.field import Field
 
 WINDOW = 3  # views in a chart: the fewest that overlap
@@ -42,7 +43,7 @@ class ChartedField(Field):
     ) -> None:  # fmt: skip
         super().__init__()
         settings |= {"sets": 1, "texture_pixels": max(1, texture_pixels // MANY), "consistency": HELD * consistency}
-        settings |= {"pace": PACE, "normalize": True}  # a ring may be a turntable, whose light does not turn
+        settings |= {"pace": PACE, "doubts": True, "normalize": True}  # a turntable's light does not turn
         self.charts = nn.ModuleList(FastField(code_dim, window, height, width, **settings) for _ in range(views))
         self.window, self.round, self.turn = window, 0, 0
         self.known: Tensor | None = None
@@ -80,8 +81,8 @@ class ChartedField(Field):
         return max(STEPS * len(self.charts), passes * self.window * steps_per_pass)
 
     def settle(self, seconds: float, views: int, batch: float, drawing: Callable[[], float]) -> float:
-        """A known view is drawn by as many charts as finish on it."""
-        return views * drawing() * (1 / JUDGED + bool(len(self.charts[0].remainder)))
+        """A known view is drawn by as many charts as finish on it, and looking it up in others takes as long again."""
+        return views * drawing() * (1 / JUDGED + 2 * bool(len(self.charts[0].remainder)))
 
     def see(self, views: Tensor) -> None:
         self.known = views
@@ -114,9 +115,15 @@ class ChartedField(Field):
         return weights / weights.sum(1, keepdim=True)
 
     def forward(self, xy: Tensor, z: Tensor) -> Tensor:
-        """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped."""
-        weights, rgb = self.weights(z), z.new_zeros(*xy.shape[:2], 3)
+        """Colours [V, P, 3] of the pixels `xy` [V, P, 2] in [-1, 1) under the codes `z` [V, M]; not clamped.
+
+        Beside their `weights` charts that overlap count, at each pixel, by the inverse of the squared error that their
+        motion makes there between known views (`FastField.judged`), as measurements do by that of their variance.
+        """
+        weights, total = self.weights(z), z.new_zeros(*xy.shape[:2], 4)
         for k in weights.any(0).nonzero()[:, 0].tolist():
             some = weights[:, k].nonzero()[:, 0]
-            rgb = rgb.index_add(0, some, weights[some, k, None, None] * self.charts[k](xy[some], z[some]))
-        return rgb
+            rgb, doubt = self.charts[k].judged(xy[some], z[some])
+            share = weights[some, k, None, None] / (doubt.square() + FAINT**2)
+            total = total.index_add(0, some, torch.cat([share * rgb, share.expand(*rgb.shape[:2], 1)], -1))
+        return total[..., :3] / total[..., 3:]

@@ -62,6 +62,7 @@ FAINT = 0.01  # rgb: deviations below this may be noise and stay smaller
 OCCLUDED = 0.05  # rgb: differences well above this count little, they may be another surface
 FEW = 4  # known views at most, if mixes of their codes are held to them too
 GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole parts, spread evenly (Weyl 1916)
+DOUBT = 9  # pixels: within twice as many it is judged how far known views are apart
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 
 
@@ -89,13 +90,15 @@ class FastField(Field):
     Coarse to fine: colours and weights are sums of levels, each twice as fine as the one before. `at(progress)` chooses
     the level in training; those before it are kept as they are, those after it do not take part. A level's weights have
     half the size of its colours; the finest level has none of its own and trains those of the level before.
-    `normalize`: known views are compared as they are `normalized`. See `config.FastModel` for the other arguments.
+    `normalize`: known views are compared as they are `normalized`. `doubts`: known views lie in a row, and how far each
+    is from those beside it, where the motion takes it, is kept with its remainder (`judged`). See `config.FastModel`
+    for the other arguments.
     """
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
                  margin: float, texture_pixels: int, sharpness: float, entropy: float, smooth: float,
                  consistency: float, remainder: bool, pace: Pace = STEADY,
-                 normalize: bool = False) -> None:  # fmt: skip
+                 normalize: bool = False, doubts: bool = False) -> None:  # fmt: skip
         super().__init__()
         self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
         self.drawn: tuple[Tensor, ...] = ()
@@ -120,7 +123,7 @@ class FastField(Field):
         self.bend = nn.Parameter(torch.zeros(sets, 4 * (motion - 1), code_dim))
         self.register_buffer("gain", torch.ones(()))
         # half precision: a remainder is small, and a scene's memory should stay near that of its images
-        shape = (views, 3, height, width) if remainder else (0, 3, 1, 1)
+        shape = (views, 3 + doubts, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion + 2))
         self.register_buffer("trust", torch.ones(sets))  # shares of the active sets in what is drawn, once finished
@@ -257,11 +260,16 @@ class FastField(Field):
         In mixed precision too everything is done in the precision of the parameters: a motion rounded to bfloat16
         would be wrong by parts of a pixel, and there are no matrix products that would gain.
         """
+        return self.judged(xy, z)[0]
+
+    def judged(self, xy: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """As `forward`, and how far the known views around were apart there, where the motion took them: the root of
+        the mean square in rgb [V, P, 1], once finished and if the field `doubts`; until then 0 []."""
         with torch.autocast(xy.device.type, enabled=False):
             return self._colours(xy.to(self.shift.dtype).transpose(1, 2).contiguous(), z.to(self.shift.dtype))
 
-    def _colours(self, xy: Tensor, z: Tensor) -> Tensor:
-        """As `forward`, from `xy` [V, 2, P]."""
+    def _colours(self, xy: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """As `judged`, from `xy` [V, 2, P]."""
         place, phi = self.place(z), self.basis(xy)
         each, weight, seen = self.each_set(xy, phi, place)
         # asked only in evaluation: on a GPU the answer must be waited for
@@ -272,8 +280,11 @@ class FastField(Field):
             undecided = (1 - weight.square().sum(1)).mean()
             self.held = (each - mean).square().mean() + self.decision * self.entropy * undecided
             self.held = self.held + self.smooth * self.roughness(xy, seen, each)
-        rgb = mean.movedim(0, -1) + 0.5
-        return rgb + self.left_over(xy, phi, place, seen) if finished and len(self.remainder) else rgb
+        rgb, doubt = mean.movedim(0, -1) + 0.5, xy.new_zeros(())
+        if finished and len(self.remainder):
+            left, doubt = self.left_over(xy, phi, place, seen).tensor_split([3], -1)
+            rgb = rgb + left
+        return rgb, doubt
 
     def mapped(self) -> bool:
         """Whether disparities and drifts are maps yet, or each layer still moves as a whole."""
@@ -361,12 +372,16 @@ class FastField(Field):
         """Where `xy` [..., 2, P] lies in the known views at the size of the level, counted in their pixels."""
         return ((xy + 1) * self.size / 2 + 0.5) / self.reductions[self.level] - 0.5
 
+    def _sized(self, views: Tensor) -> Tensor:
+        """Views [n, H, W, 3] at the size of the level in training."""
+        by = self.reductions[self.level]
+        return F.avg_pool2d(views.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else views
+
     def _maps(self) -> tuple[Tensor, Tensor]:
         """The known views [n, h, w, 3] at the size of the level in training, and what of them is compared; the same
         memory until the level changes."""
         if self.maps is None:
-            by, maps = self.reductions[self.level], self.known.to(self.shift.dtype)
-            maps = F.avg_pool2d(maps.movedim(-1, 1), by).movedim(1, -1).contiguous() if by > 1 else maps
+            maps = self._sized(self.known.to(self.shift.dtype))
             self.maps = maps, normalized(maps) if self.normalize else maps
         return self.maps
 
@@ -414,27 +429,43 @@ class FastField(Field):
         self.eval()
         x, y = (-1 + 2 * torch.arange(size).to(views) / size for size in (width, height))
 
-        def shown(code: Tensor, rows: slice) -> Tensor:
-            """What each set shows of some rows of a view, [S, 3, h, W]."""
+        def shown(code: Tensor, rows: slice) -> tuple[Tensor, tuple[Tensor, ...]]:
+            """What each set shows of some rows of a view, [S, 3, h, W], and at which pixels with which motion."""
             xy = torch.stack(torch.meshgrid(x, y[rows], indexing="xy")).flatten(1)[None]
-            each, _, _ = self.each_set(xy, self.basis(xy), self.place(code[None]))
-            return each[:, :, 0].unflatten(2, (-1, width)) + 0.5
+            phi, place = self.basis(xy), self.place(code[None])
+            each, _, seen = self.each_set(xy, phi, place)
+            return each[:, :, 0].unflatten(2, (-1, width)) + 0.5, (xy, phi, place, seen)
 
         some, many = slice(None, None, JUDGED), max(1, 65_536 // width)
         pairs = list(zip(views, codes, strict=True))
         covariance = torch.zeros(self.active, self.active).double()
         for view, z in pairs:
-            errors = (shown(z, some) - view[:, some]).flatten(1)
+            errors = (shown(z, some)[0] - view[:, some]).flatten(1)
             covariance += (errors @ errors.T).cpu() / errors.numel()
         self.trust[: self.active] = best_shares(covariance).to(self.trust)
         if len(self.remainder):
-            self.places[:, : self.active] = self.place(codes)
-            for own, (view, z) in zip(self.remainder, pairs, strict=True):
+            self.places[:, : self.active], maps = self.place(codes), self._sized(views.movedim(1, -1))
+            for number, (own, (view, z)) in enumerate(zip(self.remainder, pairs, strict=True)):
                 for rows in (slice(k, k + many) for k in range(0, height, many)):
-                    own[:, rows] = view[:, rows] - self.mean(shown(z, rows))
+                    each, drawn = shown(z, rows)
+                    own[:3, rows] = view[:, rows] - self.mean(each)
+                    if len(own) > 3:
+                        own[3, rows] = self.apart(number, maps, *drawn).view(-1, width)
+            if self.remainder.shape[1] > 3:
+                self.remainder[:, 3:] = around(self.remainder[:, 3:].to(views), DOUBT).sqrt()
         self.finished.fill_(True)
         self.known = self.maps = None  # nothing is compared any more, and whoever keeps the field need not keep them
         self.train(was)
+
+    def apart(self, number: int, maps: Tensor, xy: Tensor, phi: Tensor, place: Tensor, seen: Tensor) -> Tensor:
+        """The mean squared difference [P] of the known view `number` at `xy` from the known views beside it in the row,
+        where the motion takes it (`found`)."""
+        at = torch.tensor([number], device=xy.device)
+        own, errors = look_up(maps, at, self._pixel(xy)), []
+        for beside in {max(number - 1, 0), min(number + 1, len(maps) - 1)} - {number}:
+            there, _ = self.found(maps, at + beside - number, self.places[:, : self.active], xy, phi, place, seen)
+            errors.append(self.mean((there - own).square().mean(-1))[0])
+        return sum(errors) / len(errors)
 
     def mean(self, each: Tensor) -> Tensor:
         """The sets' mean of `each` [S, ...], each set by its trust."""
@@ -462,7 +493,7 @@ class FastField(Field):
         return near / near.sum(-1, keepdim=True), views
 
     def left_over(self, xy: Tensor, phi: Tensor, place: Tensor, seen: Tensor) -> Tensor:
-        """The known views' remainders [V, P, 3] at `xy` [V, 2, P] of views at `place`, where the sets with what is
+        """The known views' remainders [V, P, 3 or 4] at `xy` [V, 2, P] of views at `place`, where the sets with what is
         `seen` [S, 2, V, P] of disparity and drift see them on average, each by its trust."""
         shares, views = self.shares(place)
         apart = self.trust[: self.active, None] * (place[:, None] - self.places[views][:, :, : self.active])
@@ -474,7 +505,7 @@ class FastField(Field):
         scale = self.size / (self.size - 1).clamp_min(1)  # pixel centres at both ends, as grid_sample counts
         motion = (scale * weights).flatten(1, 2) @ torch.cat([phi, scaled, drift], 1)
         there = ((xy + 1) * scale - 1)[:, None] + motion.unflatten(1, (-1, 2))  # [V, N, 2, P]
-        total = xy.new_zeros(len(xy), 3, xy.shape[-1])
+        total = xy.new_zeros(len(xy), self.remainder.shape[1], xy.shape[-1])
         for share, view, at in zip(shares.unbind(1), views.unbind(1), there.unbind(1), strict=True):
             own = sample(self.remainder[view].to(at.dtype), at[:, None])[:, :, 0]
             total.addcmul_(share[:, None, None], own)
@@ -537,16 +568,17 @@ def robust(error: Tensor) -> Tensor:
 def normalized(views: Tensor) -> Tensor:
     """Colours [n, h, w, 3] less their mean around each pixel, over their deviation there, scaled to `CONTRAST`: light
     that changes from view to view leaves them as they are (as in Zhang et al. 2018, who so compare stereo pictures)."""
-
-    def around(maps: Tensor) -> Tensor:
-        for _ in range(2):
-            maps = F.avg_pool2d(maps, 3, 1, 1, count_include_pad=False)
-        return maps
-
     maps = views.movedim(-1, 1)
-    maps = maps - around(maps)
-    deviation = around(maps.square().mean(1, keepdim=True)).sqrt()
+    maps = maps - around(maps, 3)
+    deviation = around(maps.square().mean(1, keepdim=True), 3).sqrt()
     return (CONTRAST * maps / (deviation + FAINT)).movedim(1, -1).contiguous()
+
+
+def around(maps: Tensor, size: int) -> Tensor:
+    """Maps [N, C, h, w] averaged around each pixel: over `size` x `size`, twice."""
+    for _ in range(2):
+        maps = F.avg_pool2d(maps, size, 1, size // 2, count_include_pad=False)
+    return maps
 
 
 def look_up(views: Tensor, which: Tensor, at: Tensor) -> Tensor:
