@@ -42,7 +42,6 @@ CSV_COLUMNS = [
     "novel_ssim", "code_norm_min", "code_norm_max", "lr",
 ]  # fmt: skip
 
-
 log = logging.getLogger("viinter")
 
 
@@ -262,7 +261,7 @@ class ErrorClock(L.Callback):
     none if all of them together would take more than half of `max_share` of the training seconds. The clock stands
     still meanwhile. Each gives a row of `error_vs_time.csv` and scalars in TensorBoard.
 
-    A measurement after which the known views have twice their least error is warned of: too high a rate takes a sine
+    If the known views then have more than `LOST` times their least error so far, it warns: too high a rate takes a sine
     network back to one flat colour, with every number finite.
 
     One comes at the end always. Where a view takes so long to draw that it would take more than is left of

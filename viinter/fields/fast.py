@@ -107,6 +107,7 @@ class FastField(Field):
         self.kept: dict[str, tuple[list, Tensor]] = {}
         self.margin, self.sharpness, self.motion, self.pace = margin, sharpness, motion, pace
         self.entropy, self.smooth, self.consistency, self.normalize = entropy, smooth, consistency, normalize
+        self.doubts = doubts
         self.pitch = 2 / width
         self.shape, self.active = (sets, layers), sets
         layers *= sets  # those of a set one after the other
@@ -444,14 +445,15 @@ class FastField(Field):
             covariance += (errors @ errors.T).cpu() / errors.numel()
         self.trust[: self.active] = best_shares(covariance).to(self.trust)
         if len(self.remainder):
-            self.places[:, : self.active], maps = self.place(codes), self._sized(views.movedim(1, -1))
+            self.places[:, : self.active] = self.place(codes)
+            maps = self._sized(views.movedim(1, -1)) if self.doubts else None
             for number, (own, (view, z)) in enumerate(zip(self.remainder, pairs, strict=True)):
                 for rows in (slice(k, k + many) for k in range(0, height, many)):
                     each, drawn = shown(z, rows)
                     own[:3, rows] = view[:, rows] - self.mean(each)
-                    if len(own) > 3:
+                    if self.doubts:
                         own[3, rows] = self.apart(number, maps, *drawn).view(-1, width)
-            if self.remainder.shape[1] > 3:
+            if self.doubts:
                 self.remainder[:, 3:] = around(self.remainder[:, 3:].to(views), DOUBT).sqrt()
         self.finished.fill_(True)
         self.known = self.maps = None  # nothing is compared any more, and whoever keeps the field need not keep them
