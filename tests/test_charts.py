@@ -136,6 +136,18 @@ def test_a_ring_has_charts_and_any_scene_that_asks_for_them(make_config, layout,
     assert isinstance(module.make_field(make_config(layout), views, 16, 16), PaperField)
 
 
+@pytest.mark.parametrize(
+    ("layout", "views", "settings", "shape"),
+    [("planar", 9, {}, (4, 4)), ("llff", 9, {}, (2, 8)), ("folder", 5, {}, (2, 8)), ("folder", 4, {}, (4, 4)),
+     ("pair", 2, {}, (4, 4)), ("folder", 9, {"model.window": 3}, (1, 4)), ("studio", 9, {}, (1, 4)),
+     ("llff", 9, {"model.layers": 3}, (2, 3)), ("llff", 9, {"model.sets": 3}, (3, 8)),
+     ("planar", 9, {"model.layers": 8, "model.sets": 1}, (1, 8))],
+)  # fmt: skip
+def test_photographs_by_hand_have_fewer_and_deeper_sets(make_config, layout, views, settings, shape):
+    field = module.make_field(make_config(layout, model="fast", **settings), views, 16, 16)
+    assert (field.charts[0] if isinstance(field, ChartedField) else field).shape == shape
+
+
 def test_a_ring_that_was_stopped_goes_on_as_if_nothing_had_been(make_config, tmp_path):
     """At step 11 of 9 charts: in the second round."""
     cfg = make_config("studio", model="fast", **{"optim.steps": 30, "checkpoint.every_seconds": 1e-9})

@@ -329,18 +329,47 @@ def test_a_budget_that_is_too_short_for_all_sets_has_fewer(seconds, left):
     there are to be 300, at four and a half times that."""
     field = scramble(make(sets=4, layers=2))
     xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
-    kept_back = field.settle(seconds, 2, 0.25, lambda: 0.1 * field.active / 4)
+    kept_back = field.settle(seconds, 2, 0.25, lambda: 0.1 * field.sets / 4)
     assert kept_back == pytest.approx(2 * 0.1 * left / 4 * (1 + 1 / 8))
-    assert field.active == left
+    assert (field.sets, field.layers) == (left, 2)
     assert torch.allclose(field(xy, z), torch.stack([one_set(field, k)(xy, z) for k in range(left)]).mean(0), atol=1e-6)
     (field(xy, z).square().mean() + penalty(field)).backward()
     codes, views = torch.randn(2, M), torch.rand(2, 64, 64, 3)
     field.finish(views, codes)
     other = pickle.loads(pickle.dumps(make(sets=4, layers=2)))
     other.load_state_dict(field.state_dict())
-    assert other.active == left
+    assert other.sets == left
     assert torch.equal(draw(other.eval(), codes[0], 64, 64), draw(field.eval(), codes[0], 64, 64))
     assert torch.allclose(draw(other, codes[1], 64, 64), views[1], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "layers", "left"),
+    [(2, 8, (1, 4)), (16, 8, (1, 4)), (18, 8, (1, 8)), (33, 8, (1, 8)), (35, 8, (2, 8)),
+     (2, 6, (1, 4)), (2, 3, (1, 3))],
+)  # fmt: skip
+def test_a_budget_that_is_too_short_for_one_deep_set_has_fewer_layers(seconds, layers, left):
+    field = scramble(make(sets=2, layers=layers))
+    field.settle(seconds, 2, 0.25, lambda: 0.1 * field.sets * field.layers / 2 / layers)
+    assert (field.sets, field.layers) == left
+    other = make(sets=2, layers=layers)
+    other.load_state_dict(field.state_dict())
+    assert (other.sets, other.layers) == left
+    xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
+    (other(xy, z).square().mean() + penalty(other)).backward()
+    unused = other.colours[-1].grad[left[0] * left[1] :]
+    assert not unused.any()
+    assert other.colours[-1].grad[: left[0] * left[1]].abs().amax((1, 2, 3)).gt(0).all()
+
+
+@pytest.mark.parametrize("layers", [4, 6, 8])
+def test_layers_that_are_left_begin_at_disparities_as_far_apart_as_all(layers):
+    each = make(sets=2, layers=layers).disparity.view(2, layers)
+    assert torch.allclose(each.flatten().sort().values, torch.linspace(-1, 1, 2 * layers))
+    for own in each:
+        first = own[: (layers + 1) // 2]
+        assert first[0] == own.min()
+        assert torch.allclose(first.diff(), own.sort().values.diff()[:1] * 2)
 
 
 def test_finished_known_views_are_reproduced_and_a_path_through_them_has_no_jump():

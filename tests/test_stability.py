@@ -11,7 +11,7 @@ from viinter.guard import MOST
 from viinter.module import ViewInterpolator
 from viinter.stability import Axis, axes, corners, key, pairs, plan, precision, presets, stability_map, verdict
 
-FAST = {"model": "fast"}
+FAST = {"model": "fast", "model.layers": 4}  # as `stability.presets` has it
 models = pytest.mark.parametrize("model", [{}, FAST], ids=["paper", "fast"])
 
 

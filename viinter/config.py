@@ -144,8 +144,12 @@ class PaperModel(ModelConfig):
 class FastModel(ModelConfig):
     """Layers of texture carried by a learned motion (`fields/fast.py`)."""
 
-    layers: int = setting(4, "surfaces that the scene is made of, in each set")
-    sets: int = setting(4, "sets of layers, each right by itself, fewer in short budgets; their mean is drawn")
+    layers: int | None = setting(
+        None, "surfaces that the scene is made of, in each set; null: 8 of photographs by hand (llff, folder), else 4"
+    )
+    sets: int | None = setting(
+        None, "sets of layers, each right by itself, fewer in short budgets; their mean is drawn; null: 2, or else 4"
+    )
     motion: int = setting(6, "motion polynomials: 1 shifts, 3 adds turns and zooms, 6 adds perspective")
     margin: float = setting(1.1, "size of a texture in views, for what moves in from outside")
     texture_pixels: int = setting(
@@ -341,8 +345,7 @@ def check(cfg: TrainConfig) -> None:
         "evaluation.chunk_pixels": cfg.evaluation.chunk_pixels, "logging.every_seconds": cfg.logging.every_seconds,
         "checkpoint.every_seconds": cfg.checkpoint.every_seconds,
     }  # fmt: skip
-    for key in ("width", "depth", "first_omega", "hidden_omega", "layers", "sets", "margin", "texture_pixels",
-                "sharpness"):  # fmt: skip
+    for key in ("width", "depth", "first_omega", "hidden_omega", "margin", "texture_pixels", "sharpness"):
         if hasattr(cfg.model, key):
             positive[f"model.{key}"] = getattr(cfg.model, key)
     for key, value in positive.items():
@@ -352,6 +355,9 @@ def check(cfg: TrainConfig) -> None:
         for key in ("entropy", "smooth", "consistency"):
             value = getattr(cfg.model, key)
             want(value >= 0, f"model.{key}", value, "0 or more")
+        for key in ("layers", "sets"):
+            value = getattr(cfg.model, key)
+            want(value is None or value > 0, f"model.{key}", value, "a number above 0, or null")
         window = cfg.model.window
         want(window is None or window >= 2, "model.window", window, "2 or more, or null")
         want(cfg.trainer.precision not in ("16-true", "bf16-true"), "trainer.precision", cfg.trainer.precision,

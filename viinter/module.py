@@ -19,7 +19,7 @@ from viinter.codes import CodeBook
 from viinter.config import ConfigError, EvaluateConfig, Layout, RenderConfig, TrainConfig, from_plain, norm_order, plain
 from viinter.data import PixelBatch
 from viinter.fields.charts import WINDOW, ChartedField
-from viinter.fields.fast import FastField
+from viinter.fields.fast import DEEP, FEW, USUAL, FastField
 from viinter.fields.field import Field
 from viinter.fields.paper import PaperField
 from viinter.replay import ReplayedLoss
@@ -32,6 +32,9 @@ def make_field(cfg: TrainConfig, n: int, height: int, width: int) -> Field:
         return PaperField(**settings)
     settings |= {"views": n, "height": height, "width": width}
     window = settings.pop("window") or (WINDOW if cfg.scene.layout is Layout.studio else n)
+    by_hand = cfg.scene.layout in (Layout.llff, Layout.folder) and n > FEW and window >= n
+    for key, usual in zip(("layers", "sets"), DEEP if by_hand else USUAL, strict=True):
+        settings[key] = settings[key] or usual
     return FastField(**settings) if window >= n else ChartedField(window=window, **settings)
 
 

@@ -410,7 +410,8 @@ def presets(what: str, arguments: list[str]) -> list[str]:
         found += ["threads=1"]
         sizes = {"paper": ["scene.downsample=8", "optim.steps=200", "optim.batch_pixels=1024", "model.width=64",
                            "model.depth=4"],
-                 "fast": ["scene.downsample=4", "optim.steps=150", "optim.batch_pixels=2048"]}  # fmt: skip
+                 "fast": ["scene.downsample=4", "optim.steps=150", "optim.batch_pixels=2048",
+                          "model.layers=4"]}  # fmt: skip
         found += ["scale=cpu", *sizes.get(model, [])]
     elif what == "precision":
         found += ["scale=cpu"]

@@ -1,7 +1,7 @@
 """The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
 
 Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `K` motion polynomials,
-`S` active sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view (half of a
+`S` sets of `L` layers each in use. A layer has colours [3, h, w] at about the resolution of a view (half of a
 large one's, or a quarter), weights and disparities. Under the code z the pixel xy reads layer l at
 
     u_l = xy + a(xy, z) + d_l(u) b(xy, z) + e_l(u) c(z),    a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
@@ -52,6 +52,8 @@ from viinter.fields.field import Field
 MOST = 100, 300  # steps at each of the coarse levels, and at half size
 ENOUGH = 1500, 60  # steps, and passes over the known pixels: after both more time only learns known views by heart
 FEWEST = 300  # steps for which a budget in seconds should be enough, or sets are left out
+USUAL = 4, 4  # layers of a set, and sets
+DEEP = 8, 2  # the same for photographs by hand: cameras that stand anyhow see behind more than those of a grid
 STEP = 4.5  # drawings of its pixels that a training step takes as long as
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
@@ -109,7 +111,7 @@ class FastField(Field):
         self.entropy, self.smooth, self.consistency, self.normalize = entropy, smooth, consistency, normalize
         self.doubts = doubts
         self.pitch = 2 / width
-        self.shape, self.active = (sets, layers), sets
+        self.shape = self.sets, self.layers = sets, layers  # all, and those in use
         layers *= sets  # those of a set one after the other
         self.reductions = reductions(height, width, texture_pixels, pace.coarsest)
         sizes = [(round(height * margin / by), round(width * margin / by)) for by in self.reductions]
@@ -118,8 +120,9 @@ class FastField(Field):
         halves = [(max(4, h // 2), max(4, w // 2)) for h, w in sizes]
         self.weights = nn.ParameterList(torch.zeros(layers, 1, *half) for half in halves[: max(1, count - 1)])
         self.delta = nn.Parameter(torch.zeros(layers, 2, *halves[max(0, count - 2)]))
-        spread = torch.linspace(-1, 1, layers) if layers > 1 else torch.zeros(1)
-        self.disparity = nn.Parameter(spread.view(-1, sets).T.flatten())
+        spread = (torch.linspace(-1, 1, layers) if layers > 1 else torch.zeros(1)).view(-1, sets).T
+        spread = torch.cat([spread[:, ::2], spread[:, 1::2]], 1)  # the first half of a set's layers goes as far as all
+        self.disparity = nn.Parameter(spread.flatten())
         self.shift = nn.Parameter(0.02 * torch.randn(sets, 6, code_dim) / math.sqrt(code_dim))
         self.bend = nn.Parameter(torch.zeros(sets, 4 * (motion - 1), code_dim))
         self.register_buffer("gain", torch.ones(()))
@@ -127,9 +130,9 @@ class FastField(Field):
         shape = (views, 3 + doubts, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion + 2))
-        self.register_buffer("trust", torch.ones(sets))  # shares of the active sets in what is drawn, once finished
+        self.register_buffer("trust", torch.ones(sets))  # shares of the sets in use in what is drawn, once finished
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("decided", torch.zeros((), dtype=torch.long))  # how many sets are left, if so
+        self.register_buffer("decided", torch.zeros(2, dtype=torch.long))  # how many sets and layers are left, if so
         self.register_load_state_dict_post_hook(FastField._loaded)
         self.level = count - 1
         # what changes from step to step is on the device, where a CUDA graph can read it, and so is what is constant
@@ -186,15 +189,16 @@ class FastField(Field):
 
     @staticmethod
     def _loaded(field: FastField, _: Any) -> None:
-        field._leave(int(field.decided) or field.shape[0])
+        sets, layers = field.decided.tolist()
+        field._leave(sets or field.shape[0], layers or field.shape[1])
 
-    def _leave(self, sets: int) -> None:
-        if sets != self.active:
+    def _leave(self, sets: int, layers: int) -> None:
+        if (sets, layers) != (self.sets, self.layers):
             self.kept.clear()
-        self.active = sets
+        self.sets, self.layers = sets, layers
 
     def textures(self) -> Tensor:
-        """Colours and weights [S L, 4, h, w] of the active sets at the level in training.
+        """Colours and weights [S L, 4, h, w] of the layers in use at the level in training.
 
         What stays the same from call to call is kept: while one level is trained the sum of those before it, and in
         evaluation, where no gradient is asked for, all of it.
@@ -205,8 +209,8 @@ class FastField(Field):
         return self._together(self._trained("colours", colours), self._trained("weights", weights))
 
     def _in_use(self, maps: Tensor) -> Tensor:
-        """Those of the active sets; all as they are, since the gradient of a part is filled up with zeros."""
-        return maps if self.active == self.shape[0] else maps[: self.active * self.shape[1]]
+        """Those of the layers in use; all as they are, since the gradient of a part is filled up with zeros."""
+        return maps if (self.sets, self.layers) == self.shape else maps[: self.sets * self.layers]
 
     @staticmethod
     def _together(colours: Tensor, weights: Tensor) -> Tensor:
@@ -237,9 +241,9 @@ class FastField(Field):
 
     def place(self, z: Tensor) -> Tensor:
         """The motion's coefficients [V, S, 4 K + 2] under the codes `z` [V, M]: a_k and b_k of every polynomial, c."""
-        whole, difference, other = self.shift[: self.active].split(2, 1)
+        whole, difference, other = self.shift[: self.sets].split(2, 1)
         across = torch.stack([-whole[:, 1], whole[:, 0]], 1)
-        matrix = torch.cat([whole, whole + difference, self.bend[: self.active], across + other], 1)
+        matrix = torch.cat([whole, whole + difference, self.bend[: self.sets], across + other], 1)
         return F.linear(z * self.gain, matrix.flatten(0, 1)).unflatten(1, matrix.shape[:2])
 
     def basis(self, xy: Tensor) -> Tensor:
@@ -295,14 +299,14 @@ class FastField(Field):
         """What each set shows at `xy` [V, 2, P] with `basis` and `place`: its colour less 0.5 [S, 3, V, P], its layers'
         weights [S, L, V, P], and its disparity and drift [S, 2, V, P]."""
         a, b, c = (part[:, None] for part in self.carry(phi, place))  # [S, 1, V, 2, P]
-        disparity = self.disparity.view(*self.shape, 1, 1)[: self.active]
+        disparity = self._in_use(self.disparity).view(self.sets, self.layers, 1, 1)
         u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
         drift = None
         if self.mapped():
             delta, drift = read(self._in_use(self.delta), u).unbind(2)
             u, disparity = torch.addcmul(u, delta[:, :, :, None], b), disparity + delta
             # a product of matrices, since c is the same for all pixels: its gradient is a sum over them
-            c = c.expand(-1, self.shape[1], -1, -1, -1).flatten(0, 2)
+            c = c.expand(-1, self.layers, -1, -1, -1).flatten(0, 2)
             u = torch.baddbmm(u.flatten(0, 2), c, drift.flatten(0, 2)[:, None]).view(u.shape)
         colour, weight = read(self.textures(), u).split([3, 1], 2)
         weight = torch.softmax(self.sharpness * weight, 1)
@@ -411,13 +415,16 @@ class FastField(Field):
         return max(steps, passes * steps_per_pass)
 
     def settle(self, seconds: float, views: int, batch: float, drawing: Callable[[], float]) -> float:
-        """Halves the sets until the budget is enough for `FEWEST` steps: in too few of them many sets learn less than
-        one that has all the time to itself."""
+        """Halves the sets, and then the last one's layers down to the usual, until the budget is enough for `FEWEST`
+        steps: in too few of them many sets learn less than one that has all the time to itself."""
         took = drawing()
-        while self.active > 1 and seconds < FEWEST * STEP * batch * took:
-            self._leave((self.active + 1) // 2)
+        while (self.sets > 1 or self.layers > USUAL[0]) and seconds < FEWEST * STEP * batch * took:
+            if self.sets > 1:
+                self._leave((self.sets + 1) // 2, self.layers)
+            else:
+                self._leave(1, max(USUAL[0], self.layers // 2))
             took = drawing()
-        self.decided.fill_(self.active)
+        self.decided.copy_(torch.tensor([self.sets, self.layers]))
         return views * took * (1 / JUDGED + bool(len(self.remainder)))
 
     @torch.no_grad()
@@ -439,13 +446,13 @@ class FastField(Field):
 
         some, many = slice(None, None, JUDGED), max(1, 65_536 // width)
         pairs = list(zip(views, codes, strict=True))
-        covariance = torch.zeros(self.active, self.active).double()
+        covariance = torch.zeros(self.sets, self.sets).double()
         for view, z in pairs:
             errors = (shown(z, some)[0] - view[:, some]).flatten(1)
             covariance += (errors @ errors.T).cpu() / errors.numel()
-        self.trust[: self.active] = best_shares(covariance).to(self.trust)
+        self.trust[: self.sets] = best_shares(covariance).to(self.trust)
         if len(self.remainder):
-            self.places[:, : self.active] = self.place(codes)
+            self.places[:, : self.sets] = self.place(codes)
             maps = self._sized(views.movedim(1, -1)) if self.doubts else None
             for number, (own, (view, z)) in enumerate(zip(self.remainder, pairs, strict=True)):
                 for rows in (slice(k, k + many) for k in range(0, height, many)):
@@ -465,13 +472,13 @@ class FastField(Field):
         at = torch.tensor([number], device=xy.device)
         own, errors = look_up(maps, at, self._pixel(xy)), []
         for beside in {max(number - 1, 0), min(number + 1, len(maps) - 1)} - {number}:
-            there, _ = self.found(maps, at + beside - number, self.places[:, : self.active], xy, phi, place, seen)
+            there, _ = self.found(maps, at + beside - number, self.places[:, : self.sets], xy, phi, place, seen)
             errors.append(self.mean((there - own).square().mean(-1))[0])
         return sum(errors) / len(errors)
 
     def mean(self, each: Tensor) -> Tensor:
         """The sets' mean of `each` [S, ...], each set by its trust."""
-        return torch.tensordot(self.trust[: self.active], each, 1)
+        return torch.tensordot(self.trust[: self.sets], each, 1)
 
     def shares(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """How much each of the `N` known views nearest to `place` [V, S, 4 K + 2] gives of its remainder: [V, N],
@@ -481,8 +488,8 @@ class FastField(Field):
         distance of the first view that is left out, so that a view enters and leaves a path without a jump (Shepard's
         interpolation, as Franke and Nielson 1980 made it local).
         """
-        trust = self.trust[: self.active, None]
-        place, known = (trust * place).flatten(1), (trust * self.places[:, : self.active]).flatten(1)
+        trust = self.trust[: self.sets, None]
+        place, known = (trust * place).flatten(1), (trust * self.places[:, : self.sets]).flatten(1)
         apart = torch.cdist(place, known, compute_mode="donot_use_mm_for_euclid_dist")  # that would be inexact
         apart = apart.clamp_min(1e-6)  # two views may be at one place
         apart, views = apart.topk(min(NEAREST + 1, apart.shape[1]), largest=False)
@@ -498,7 +505,7 @@ class FastField(Field):
         """The known views' remainders [V, P, 3 or 4] at `xy` [V, 2, P] of views at `place`, where the sets with what is
         `seen` [S, 2, V, P] of disparity and drift see them on average, each by its trust."""
         shares, views = self.shares(place)
-        apart = self.trust[: self.active, None] * (place[:, None] - self.places[views][:, :, : self.active])
+        apart = self.trust[: self.sets, None] * (place[:, None] - self.places[views][:, :, : self.sets])
         polynomials, c = apart.split([4 * self.motion, 2], 3)
         a, b = polynomials.unflatten(3, (self.motion, 4)).split(2, 4)  # [V, N, S, K, 2]
         weights = torch.cat([a.sum(2), b.flatten(2, 3), c], 2).transpose(2, 3)
