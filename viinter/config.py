@@ -145,10 +145,14 @@ class FastModel(ModelConfig):
     """Layers of texture carried by a learned motion (`fields/fast.py`)."""
 
     layers: int | None = setting(
-        None, "surfaces of the scene, in each set; null: 8 for more than 4 photographs by hand (llff, folder), else 4"
+        None,
+        "surfaces of the scene, in each set, down to 4 in the shortest budgets; null: 8 for more than 4 photographs by "
+        "hand (llff, folder), else 4",
     )
     sets: int | None = setting(
-        None, "sets of layers, each right by itself, fewer in short budgets; their mean is drawn; null: 2 for those, 4"
+        None,
+        "sets of layers, each right by itself, fewer in short budgets; their mean is drawn; null: 2 for more than 4 "
+        "photographs by hand, else 4",
     )
     motion: int = setting(6, "motion polynomials: 1 shifts, 3 adds turns and zooms, 6 adds perspective")
     margin: float = setting(1.1, "size of a texture in views, for what moves in from outside")
