@@ -366,6 +366,24 @@ def test_finishing_takes_at_most_half_of_a_budget_from_the_steps(make_config, tm
     assert train(make_config(**{"optim.training_seconds": 2.0}), tmp_path)["steps"] == 1.0 / 0.25
 
 
+def test_the_schedule_begins_with_the_first_step_however_long_settling_took(
+    make_config, tmp_path, stopwatch, monkeypatch
+):
+    """Steps of 0.25 s, ten seconds of settling: of 20 seconds half are left, and the schedule lies over these."""
+    takes(monkeypatch, stopwatch, PaperField, "settle", 10.0)
+    found, seen, values = rates(monkeypatch), [], {"optim.lr": 1e-3, "optim.lr_decay": 0.1}
+    monkeypatch.setattr(PaperField, "at", lambda field, progress, step: seen.append(progress))
+    metrics = train(make_config(**values, **{"optim.training_seconds": 20.0}), tmp_path)
+    assert (metrics["training_seconds"], metrics["steps"]) == (20.0, 40)
+    assert seen == pytest.approx([step / 40 for step in range(40)])
+    assert found == pytest.approx([cosine(1e-3, 0.1, step / 40) for step in range(40)])
+
+
+def test_a_budget_that_settling_used_up_has_no_steps(make_config, tmp_path, stopwatch, monkeypatch):
+    takes(monkeypatch, stopwatch, PaperField, "settle", 10.0)
+    assert train(make_config(**{"optim.training_seconds": 9.0}), tmp_path)["steps"] == 0
+
+
 def test_seconds_that_a_field_has_no_use_for_are_left_over(make_config, tmp_path, monkeypatch, capsys):
     """The schedule is laid over the steps that are of use; a budget of steps is kept."""
     passes = []

@@ -1,5 +1,6 @@
 """The fast field: motion, levels, remainders, and a small scene that moves."""
 
+import copy
 import pickle
 
 import pytest
@@ -25,7 +26,7 @@ def make(height: int = 64, width: int = 64, views: int = 2, **changes) -> FastFi
 
 def one_set(field: FastField, k: int) -> FastField:
     """Set number k of `field` as a field of its own."""
-    sets, layers = field.shape
+    sets, layers = field.sets, field.layers
     one = make(sets=1, layers=layers, entropy=field.entropy)
     one.level, of_a_set = field.level, ("colours", "weights", "delta", "disparity", "shift", "bend")
     for key, value in one.state_dict().items():
@@ -229,6 +230,19 @@ def test_in_long_runs_coarse_levels_end_after_so_many_steps():
     assert field.level == 3
 
 
+@pytest.mark.parametrize(
+    ("steps", "first"),
+    [(1000, {0: 0, 1: 60, 2: 120, 3: 300}), (64, {0: 0, 1: 10, 2: 20, 3: 35}), (32, {0: 0, 1: 7, 2: 13, 3: 21})],
+)
+def test_in_short_budgets_coarse_levels_have_a_larger_share(steps, first):
+    """In 64 steps those that they are to have at least; in 32 the shares that they may have at most."""
+    field, found = make(256, 256, views=0, layers=1), {}
+    for step in range(steps):
+        field.at(step / steps, step)
+        found.setdefault(field.level, step)
+    assert found == first
+
+
 def test_enough_are_so_many_steps_and_so_many_passes():
     field = make(views=0)
     assert [field.enough(steps_per_pass) for steps_per_pass in (0.1, 25, 25.5, 100)] == [1500, 1500, 1530, 6000]
@@ -328,12 +342,11 @@ def test_a_budget_that_is_too_short_for_all_sets_has_fewer(seconds, left):
     """A step has a quarter of a view's pixels, which is drawn in a tenth of a second with all the sets: of such steps
     there are to be 300, at four and a half times that."""
     field = scramble(make(sets=4, layers=2))
-    xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
+    xy, z, whole = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M), copy.deepcopy(field)
     kept_back = field.settle(seconds, 2, 0.25, lambda: 0.1 * field.sets / 4)
     assert kept_back == pytest.approx(2 * 0.1 * left / 4 * (1 + 1 / 8))
     assert (field.sets, field.layers) == (left, 2)
-    assert torch.allclose(field(xy, z), torch.stack([one_set(field, k)(xy, z) for k in range(left)]).mean(0), atol=1e-6)
-    (field(xy, z).square().mean() + penalty(field)).backward()
+    assert torch.allclose(field(xy, z), torch.stack([one_set(whole, k)(xy, z) for k in range(left)]).mean(0), atol=1e-6)
     codes, views = torch.randn(2, M), torch.rand(2, 64, 64, 3)
     field.finish(views, codes)
     other = pickle.loads(pickle.dumps(make(sets=4, layers=2)))
@@ -350,16 +363,26 @@ def test_a_budget_that_is_too_short_for_all_sets_has_fewer(seconds, left):
 )  # fmt: skip
 def test_a_budget_that_is_too_short_for_one_deep_set_has_fewer_layers(seconds, layers, left):
     field = scramble(make(sets=2, layers=layers))
+    whole, optimizer = copy.deepcopy(field), torch.optim.Adam(field.parameters(), lr=0.1)
     field.settle(seconds, 2, 0.25, lambda: 0.1 * field.sets * field.layers / 2 / layers)
     assert (field.sets, field.layers) == left
+    of_a_set = whole.colours[-1].unflatten(0, (2, layers))
+    assert torch.equal(field.colours[-1], of_a_set[: left[0], : left[1]].flatten(0, 1))
     other = make(sets=2, layers=layers)
     other.load_state_dict(field.state_dict())
     assert (other.sets, other.layers) == left
     xy, z = torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
-    (other(xy, z).square().mean() + penalty(other)).backward()
-    unused = other.colours[-1].grad[left[0] * left[1] :]
-    assert not unused.any()
-    assert other.colours[-1].grad[: left[0] * left[1]].abs().amax((1, 2, 3)).gt(0).all()
+    assert torch.equal(other(xy, z), field(xy, z))
+    (field(xy, z).square().mean() + penalty(field)).backward()
+    optimizer.step()  # it was made before, as in a run
+    assert (field.colours[-1] != other.colours[-1]).flatten(1).any(1).all()
+
+
+def test_processes_that_train_together_keep_all_sets(monkeypatch):
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    field = make(sets=4, layers=8)
+    field.settle(0.1, 2, 0.25, lambda: 1.0)
+    assert (field.sets, field.layers) == (4, 8)
 
 
 @pytest.mark.parametrize("layers", [4, 6, 8])

@@ -8,7 +8,6 @@ callbacks, a twin of the model takes one step in plain PyTorch. Whatever the mac
 from __future__ import annotations
 
 import itertools
-import math
 import multiprocessing
 import re
 import statistics
@@ -295,7 +294,8 @@ def scaling(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
         rows.append(["exponent", *("" if powers[key] is None else f"{powers[key]:.2f}" for key in keys)])
         shown(f"by {what}", [what, f"s to {SCALING_TARGET} dB", "ms a step", "peak MB"], rows)
         result[what] = {"measured": measured, "exponents": powers}
-    layers, pixels = math.prod(load(run.folder).field.shape), run.setting("optim.batch_pixels")
+    field, pixels = load(run.folder).field, run.setting("optim.batch_pixels")
+    layers = field.sets * field.layers
     *_, by = reductions(whole.height, whole.width, run.setting("model.texture_pixels"))
     result["a step"] = races.step_work(whole.height / by, whole.width / by, layers, pixels)
     shown(f"One step, {layers} layers, {pixels} pixels", ["", *result["a step"]],

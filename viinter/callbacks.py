@@ -109,18 +109,20 @@ class Budget(L.Callback):
     """Ends the run after so many steps or training seconds, and lays the cosine schedule over whichever is given.
 
     The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end. The
-    field is told where the budget stands before each step, and finishes on the clock: see `fields.field.Field`. The
-    seconds that this will take are kept back from the steps, but half of the training seconds at most. Training
-    seconds that are more than the field has a use for are left over.
+    field is told where the budget stands before each step, and settles and finishes on the clock: see
+    `fields.field.Field`. The seconds that finishing will take are kept back from the steps, but half of the training
+    seconds at most; the schedule is laid over those from the first step to there. Training seconds that are more than
+    the field has a use for are left over.
     """
 
     def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
-        self.cfg, self.clock, self.kept_back, self.enough = cfg, clock, 0.0, math.inf
+        self.cfg, self.clock, self.begun, self.kept_back, self.enough = cfg, clock, 0.0, 0.0, math.inf
 
     def progress(self, trainer: L.Trainer) -> float:
         """The share of the budget that is used, in [0, 1]."""
         if (seconds := self.cfg.training_seconds) is not None:
-            used = self.clock.seconds / (seconds - min(self.kept_back, seconds / 2))
+            stepping = seconds - min(self.kept_back, seconds / 2) - self.begun
+            used = (self.clock.seconds - self.begun) / stepping if stepping > 0 else 1.0
             return min(max(used, trainer.global_step / self.enough), 1.0)
         return min(trainer.global_step / self.cfg.steps, 1.0)
 
@@ -138,6 +140,7 @@ class Budget(L.Callback):
             self.kept_back = module.field.settle(
                 seconds, store.n, batch, lambda: agreed(trainer, seconds_to_draw(module, store.height, store.width))
             )
+            self.begun = self.clock.seconds
         trainer.should_stop = agreed(trainer, self.progress(trainer)) >= 1
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
@@ -157,11 +160,11 @@ class Budget(L.Callback):
         self.clock.stop()
 
     def state_dict(self) -> dict[str, float]:
-        return {**self.clock.state_dict(), "kept_back": self.kept_back}
+        return {**self.clock.state_dict(), "begun": self.begun, "kept_back": self.kept_back}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
         self.clock.load_state_dict(state)
-        self.kept_back = state["kept_back"]
+        self.begun, self.kept_back = state["begun"], state["kept_back"]
 
 
 def seconds_to_draw(module: ViewInterpolator, height: int, width: int, chunk_pixels: int = 65_536) -> float:

@@ -1,7 +1,7 @@
 """The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
 
 Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `K` motion polynomials,
-`S` sets of `L` layers each in use. A layer has colours [3, h, w] at about the resolution of a view (half of a
+`S` sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view (half of a
 large one's, or a quarter), weights and disparities. Under the code z the pixel xy reads layer l at
 
     u_l = xy + a(xy, z) + d_l(u) b(xy, z) + e_l(u) c(z),    a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
@@ -51,6 +51,8 @@ from torch import Tensor, nn
 from viinter.fields.field import Field
 
 MOST = 100, 300  # steps at each of the coarse levels, and at half size
+LEAST = 10, 15  # the same in short budgets, unless they take more than these shares of it until they are finished:
+LATEST = 0.40, 0.65
 ENOUGH = 1500, 60  # steps, and passes over the known pixels: after both more time only learns known views by heart
 FEWEST = 300  # steps for which a budget in seconds should be enough, or sets are left out
 USUAL = 4, 4  # layers of a set, and sets
@@ -112,7 +114,7 @@ class FastField(Field):
         self.entropy, self.smooth, self.consistency, self.normalize = entropy, smooth, consistency, normalize
         self.doubts = doubts
         self.pitch = 2 / width
-        self.shape = self.sets, self.layers = sets, layers  # all, and those in use
+        self.sets, self.layers = sets, layers
         layers *= sets  # those of a set one after the other
         self.reductions = reductions(height, width, texture_pixels, pace.coarsest)
         sizes = [(round(height * margin / by), round(width * margin / by)) for by in self.reductions]
@@ -131,10 +133,10 @@ class FastField(Field):
         shape = (views, 3 + doubts, height, width) if remainder else (0, 3, 1, 1)
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion + 2))
-        self.register_buffer("trust", torch.ones(sets))  # shares of the sets in use in what is drawn, once finished
+        self.register_buffer("trust", torch.ones(sets))  # shares of the sets in what is drawn, once finished
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("decided", torch.zeros(2, dtype=torch.long))  # how many sets and layers are left, if so
-        self.register_load_state_dict_post_hook(FastField._loaded)
+        self.register_buffer("left", torch.tensor([sets, self.layers]))  # how many sets, and layers of each (`settle`)
+        self.register_load_state_dict_pre_hook(FastField._loads)
         self.level = count - 1
         # what changes from step to step is on the device, where a CUDA graph can read it, and so is what is constant
         self.register_buffer("step", torch.zeros((), dtype=torch.long), persistent=False)
@@ -168,14 +170,20 @@ class FastField(Field):
         """Chooses the level in training for the share of the budget that is used, in [0, 1], and the step.
 
         `Pace` lays the levels over the budget, the finest with most of it, but none before that has more steps than
-        `MOST`: textures that are finished before the motion is known hold it where it is. The penalty on mixed weights
-        is faded in over the finest level's first part: a decision made then is often wrong too.
+        `MOST`: textures that are finished before the motion is known hold it where it is. In a short budget they have
+        a larger share, for `LEAST` steps: until the motion is about right finer textures learn nothing. The penalty on
+        mixed weights is faded in over the finest level's first part: a decision made then is often wrong too.
         """
         self.finished.fill_(False)
         count = len(self.colours)
-        coarse, half = count - 2, self.pace.half
-        ends = [self.pace.coarse * (k + 1) / coarse for k in range(coarse)] + [half, 1.0]
-        most = [MOST[0] * (k + 1) for k in range(coarse)] + [MOST[0] * max(0, coarse) + MOST[1], math.inf]
+        coarse, a_step = max(0, count - 2), progress / step if step else 0.0  # that is its share of the budget
+        least = LEAST[0] * coarse, LEAST[0] * coarse + LEAST[1]
+        finished, half = (
+            max(usual, min(steps * a_step, latest))
+            for usual, steps, latest in zip((self.pace.coarse, self.pace.half), least, LATEST, strict=True)
+        )
+        ends = [finished * (k + 1) / coarse for k in range(coarse)] + [half, 1.0]
+        most = [MOST[0] * (k + 1) for k in range(coarse)] + [MOST[0] * coarse + MOST[1], math.inf]
         stages = zip(ends[-count:], most[-count:], strict=True)
         level = next((k for k, (end, last) in enumerate(stages) if progress < end and step < last), count - 1)
         if level != self.level:
@@ -189,29 +197,35 @@ class FastField(Field):
         return self.level
 
     @staticmethod
-    def _loaded(field: FastField, _: Any) -> None:
-        sets, layers = field.decided.tolist()
-        field._leave(sets or field.shape[0], layers or field.shape[1])
+    def _loads(field: FastField, state: dict[str, Any], prefix: str, *_: Any) -> None:
+        """Leaves as many sets and layers as the field has that the `state` is of."""
+        if (left := state.get(f"{prefix}left")) is not None:
+            field._leave(*left.tolist())
 
     def _leave(self, sets: int, layers: int) -> None:
-        if (sets, layers) != (self.sets, self.layers):
-            self.kept.clear()
+        """Drops all but the first sets, and of them all but the first layers. What stays are the same parameters: an
+        optimiser may hold them already."""
+        if (sets, layers) == (self.sets, self.layers):
+            return
+        for maps in (*self.colours, *self.weights, self.delta, self.disparity):
+            maps.data = maps.data.unflatten(0, (self.sets, self.layers))[:sets, :layers].flatten(0, 1).clone()
+        for own in (self.shift, self.bend, self.trust):
+            own.data = own.data[:sets].clone()
+        self.places = self.places[:, :sets].clone()
         self.sets, self.layers = sets, layers
+        self.left.copy_(torch.tensor([sets, layers]))
+        self.kept.clear()
 
     def textures(self) -> Tensor:
-        """Colours and weights [S L, 4, h, w] of the layers in use at the level in training.
+        """Colours and weights [S L, 4, h, w] of the layers at the level in training.
 
         What stays the same from call to call is kept: while one level is trained the sum of those before it, and in
         evaluation, where no gradient is asked for, all of it.
         """
-        colours, weights = ([self._in_use(t) for t in list(g)[: self.level + 1]] for g in (self.colours, self.weights))
+        colours, weights = (list(maps)[: self.level + 1] for maps in (self.colours, self.weights))
         if not self.training and not torch.is_grad_enabled():
             return self._kept("drawn", [*colours, *weights], lambda: self._together(pyramid(colours), pyramid(weights)))
         return self._together(self._trained("colours", colours), self._trained("weights", weights))
-
-    def _in_use(self, maps: Tensor) -> Tensor:
-        """Those of the layers in use; all as they are, since the gradient of a part is filled up with zeros."""
-        return maps if (self.sets, self.layers) == self.shape else maps[: self.sets * self.layers]
 
     @staticmethod
     def _together(colours: Tensor, weights: Tensor) -> Tensor:
@@ -242,9 +256,9 @@ class FastField(Field):
 
     def place(self, z: Tensor) -> Tensor:
         """The motion's coefficients [V, S, 4 K + 2] under the codes `z` [V, M]: a_k and b_k of every polynomial, c."""
-        whole, difference, other = self.shift[: self.sets].split(2, 1)
+        whole, difference, other = self.shift.split(2, 1)
         across = torch.stack([-whole[:, 1], whole[:, 0]], 1)
-        matrix = torch.cat([whole, whole + difference, self.bend[: self.sets], across + other], 1)
+        matrix = torch.cat([whole, whole + difference, self.bend, across + other], 1)
         return F.linear(z * self.gain, matrix.flatten(0, 1)).unflatten(1, matrix.shape[:2])
 
     def basis(self, xy: Tensor) -> Tensor:
@@ -300,11 +314,11 @@ class FastField(Field):
         """What each set shows at `xy` [V, 2, P] with `basis` and `place`: its colour less 0.5 [S, 3, V, P], its layers'
         weights [S, L, V, P], and its disparity and drift [S, 2, V, P]."""
         a, b, c = (part[:, None] for part in self.carry(phi, place))  # [S, 1, V, 2, P]
-        disparity = self._in_use(self.disparity).view(self.sets, self.layers, 1, 1)
+        disparity = self.disparity.view(self.sets, self.layers, 1, 1)
         u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
         drift = None
         if self.mapped():
-            delta, drift = read(self._in_use(self.delta), u).unbind(2)
+            delta, drift = read(self.delta, u).unbind(2)
             u, disparity = torch.addcmul(u, delta[:, :, :, None], b), disparity + delta
             # a product of matrices, since c is the same for all pixels: its gradient is a sum over them
             c = c.expand(-1, self.layers, -1, -1, -1).flatten(0, 2)
@@ -417,15 +431,15 @@ class FastField(Field):
 
     def settle(self, seconds: float, views: int, batch: float, drawing: Callable[[], float]) -> float:
         """Halves the sets, and then the last one's layers down to the usual, until the budget is enough for `FEWEST`
-        steps: in too few of them many sets learn less than one that has all the time to itself."""
-        took = drawing()
-        while (self.sets > 1 or self.layers > USUAL[0]) and seconds < FEWEST * STEP * batch * took:
+        steps: in too few of them many sets learn less than one that has all the time to itself. Where processes train
+        together all stay: they have agreed on the parameters' sizes."""
+        took, alone = drawing(), not torch.distributed.is_initialized()
+        while alone and (self.sets > 1 or self.layers > USUAL[0]) and seconds < FEWEST * STEP * batch * took:
             if self.sets > 1:
                 self._leave((self.sets + 1) // 2, self.layers)
             else:
                 self._leave(1, max(USUAL[0], self.layers // 2))
             took = drawing()
-        self.decided.copy_(torch.tensor([self.sets, self.layers]))
         return views * took * (1 / JUDGED + bool(len(self.remainder)))
 
     @torch.no_grad()
@@ -451,9 +465,9 @@ class FastField(Field):
         for view, z in pairs:
             errors = (shown(z, some)[0] - view[:, some]).flatten(1)
             covariance += (errors @ errors.T).cpu() / errors.numel()
-        self.trust[: self.sets] = best_shares(covariance).to(self.trust)
+        self.trust.copy_(best_shares(covariance))
         if len(self.remainder):
-            self.places[:, : self.sets] = self.place(codes)
+            self.places.copy_(self.place(codes))
             maps = self._sized(views.movedim(1, -1)) if self.doubts else None
             for number, (own, (view, z)) in enumerate(zip(self.remainder, pairs, strict=True)):
                 for rows in (slice(k, k + many) for k in range(0, height, many)):
@@ -473,13 +487,13 @@ class FastField(Field):
         at = torch.tensor([number], device=xy.device)
         own, errors = look_up(maps, at, self._pixel(xy)), []
         for beside in {max(number - 1, 0), min(number + 1, len(maps) - 1)} - {number}:
-            there, _ = self.found(maps, at + beside - number, self.places[:, : self.sets], xy, phi, place, seen)
+            there, _ = self.found(maps, at + beside - number, self.places, xy, phi, place, seen)
             errors.append(self.mean((there - own).square().mean(-1))[0])
         return sum(errors) / len(errors)
 
     def mean(self, each: Tensor) -> Tensor:
         """The sets' mean of `each` [S, ...], each set by its trust."""
-        return torch.tensordot(self.trust[: self.sets], each, 1)
+        return torch.tensordot(self.trust, each, 1)
 
     def shares(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """How much each of the `N` known views nearest to `place` [V, S, 4 K + 2] gives of its remainder: [V, N],
@@ -489,8 +503,8 @@ class FastField(Field):
         distance of the first view that is left out, so that a view enters and leaves a path without a jump (Shepard's
         interpolation, as Franke and Nielson 1980 made it local).
         """
-        trust = self.trust[: self.sets, None]
-        place, known = (trust * place).flatten(1), (trust * self.places[:, : self.sets]).flatten(1)
+        trust = self.trust[:, None]
+        place, known = (trust * place).flatten(1), (trust * self.places).flatten(1)
         apart = torch.cdist(place, known, compute_mode="donot_use_mm_for_euclid_dist")  # that would be inexact
         apart = apart.clamp_min(1e-6)  # two views may be at one place
         apart, views = apart.topk(min(NEAREST + 1, apart.shape[1]), largest=False)
@@ -506,7 +520,7 @@ class FastField(Field):
         """The known views' remainders [V, P, 3 or 4] at `xy` [V, 2, P] of views at `place`, where the sets with what is
         `seen` [S, 2, V, P] of disparity and drift see them on average, each by its trust."""
         shares, views = self.shares(place)
-        apart = self.trust[: self.sets, None] * (place[:, None] - self.places[views][:, :, : self.sets])
+        apart = self.trust[:, None] * (place[:, None] - self.places[views])
         polynomials, c = apart.split([4 * self.motion, 2], 3)
         a, b = polynomials.unflatten(3, (self.motion, 4)).split(2, 4)  # [V, N, S, K, 2]
         weights = torch.cat([a.sum(2), b.flatten(2, 3), c], 2).transpose(2, 3)
