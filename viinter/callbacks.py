@@ -164,7 +164,7 @@ class Budget(L.Callback):
 
     def load_state_dict(self, state: dict[str, float]) -> None:
         self.clock.load_state_dict(state)
-        self.begun, self.kept_back = state["begun"], state["kept_back"]
+        self.begun, self.kept_back = state.get("begun", 0.0), state["kept_back"]
 
 
 def seconds_to_draw(module: ViewInterpolator, height: int, width: int, chunk_pixels: int = 65_536) -> float:
