@@ -379,6 +379,16 @@ def test_the_schedule_begins_with_the_first_step_however_long_settling_took(
     assert found == pytest.approx([cosine(1e-3, 0.1, step / 40) for step in range(40)])
 
 
+def test_a_schedule_that_goes_on_knows_where_it_began():
+    trainer, cfg, clock = SimpleNamespace(global_step=0), OptimConfig(training_seconds=100.0), Clock()
+    first, clock.before = Budget(cfg, clock), 40.0
+    first.begun, first.kept_back = 20.0, 30.0
+    assert first.progress(trainer) == pytest.approx((40 - 20) / (100 - 20 - 30))
+    other = Budget(cfg, Clock())
+    other.load_state_dict(first.state_dict())
+    assert other.progress(trainer) == pytest.approx(first.progress(trainer))
+
+
 def test_a_budget_that_settling_used_up_has_no_steps(make_config, tmp_path, stopwatch, monkeypatch):
     takes(monkeypatch, stopwatch, PaperField, "settle", 10.0)
     assert train(make_config(**{"optim.training_seconds": 9.0}), tmp_path)["steps"] == 0

@@ -1,8 +1,8 @@
 """The fast field: a few surfaces with a texture each, carried by a motion that is linear in the code.
 
 Notation: `V` codes at once, `P` pixels under each, `M` the length of a code, `n` known views, `K` motion polynomials,
-`S` sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view (half of a
-large one's, or a quarter), weights and disparities. Under the code z the pixel xy reads layer l at
+`S` sets of `L` layers each. A layer has colours [3, h, w] at about the resolution of a view (half of a large one's, or
+a quarter), weights and disparities. Under the code z the pixel xy reads layer l at
 
     u_l = xy + a(xy, z) + d_l(u) b(xy, z) + e_l(u) c(z),    a = sum_k phi_k(xy) a_k(z),  b = sum_k phi_k(xy) b_k(z),
 
@@ -178,11 +178,11 @@ class FastField(Field):
         count = len(self.colours)
         coarse, a_step = max(0, count - 2), progress / step if step else 0.0  # that is its share of the budget
         least = LEAST[0] * coarse, LEAST[0] * coarse + LEAST[1]
-        finished, half = (
+        early, half = (
             max(usual, min(steps * a_step, latest))
             for usual, steps, latest in zip((self.pace.coarse, self.pace.half), least, LATEST, strict=True)
         )
-        ends = [finished * (k + 1) / coarse for k in range(coarse)] + [half, 1.0]
+        ends = [early * (k + 1) / coarse for k in range(coarse)] + [half, 1.0]
         most = [MOST[0] * (k + 1) for k in range(coarse)] + [MOST[0] * coarse + MOST[1], math.inf]
         stages = zip(ends[-count:], most[-count:], strict=True)
         level = next((k for k, (end, last) in enumerate(stages) if progress < end and step < last), count - 1)
