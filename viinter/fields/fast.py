@@ -135,7 +135,6 @@ class FastField(Field):
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion + 2))
         self.register_buffer("trust", torch.ones(sets))  # shares of the sets in what is drawn, once finished
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("left", torch.tensor([sets, self.layers]))  # how many sets, and layers of each (`settle`)
         self.register_load_state_dict_pre_hook(FastField._loads)
         self.level = count - 1
         # what changes from step to step is on the device, where a CUDA graph can read it, and so is what is constant
@@ -199,8 +198,9 @@ class FastField(Field):
     @staticmethod
     def _loads(field: FastField, state: dict[str, Any], prefix: str, *_: Any) -> None:
         """Leaves as many sets and layers as the field has that the `state` is of."""
-        if (left := state.get(f"{prefix}left")) is not None:
-            field._leave(*left.tolist())
+        if {f"{prefix}shift", f"{prefix}disparity"} <= set(state):
+            sets = max(1, len(state[f"{prefix}shift"]))
+            field._leave(sets, len(state[f"{prefix}disparity"]) // sets)
 
     def _leave(self, sets: int, layers: int) -> None:
         """Drops all but the first sets, and of them all but the first layers. What stays are the same parameters: an
@@ -213,7 +213,6 @@ class FastField(Field):
             own.data = own.data[:sets].clone()
         self.places = self.places[:, :sets].clone()
         self.sets, self.layers = sets, layers
-        self.left.copy_(torch.tensor([sets, layers]))
         self.kept.clear()
 
     def textures(self) -> Tensor:
