@@ -17,6 +17,8 @@ from torch import Tensor
 from viinter.config import PixelsFrom
 from viinter.scenes import Scene
 
+PIECES = 4  # of a row, one of which comes from one view (docs/fast.md)
+
 
 class PixelBatch(NamedTuple):
     """`view` [V] indices of known views, `xy` [V, P, 2] in [-1, 1), `rgb` [V, P, 3] in [0, 1]."""
@@ -31,9 +33,9 @@ class PixelStore:
 
     Batch k depends on `seed` and k alone, so that a resumed run goes on with the very batches it would have had.
     `one_view`: `pixels` of one random view (the published code). `all_views`: the same number spread evenly over
-    all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: whole rows, evenly
-    spread over the frame and each of a random view, as many as come nearest to `pixels`; a field that reads textures
-    finds what it needs of them in the cache.
+    all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: pieces a quarter of
+    a row long, evenly spread over the frame and each of a random view, as many as come nearest to `pixels`; a field
+    that reads textures finds what it needs of them in the cache. A piece that reaches a row's end goes on in the next.
 
     Of several processes that train together, `parts`, each gets an equal share of the batch that one alone would have,
     number `part` of them; what is spread is rounded up to a multiple of `parts`.
@@ -54,9 +56,21 @@ class PixelStore:
 
     def batch(self, k: int) -> PixelBatch:
         """Batch number `k`."""
-        random, device = self.generator.manual_seed((self.seed * 0x9E3779B1 + k) % 2**32), self.rgb.device
+        view, pixel = self._drawn(self.generator.manual_seed((self.seed * 0x9E3779B1 + k) % 2**32))
+        row = torch.div(pixel, self.width, rounding_mode="floor")
+        xy = torch.stack([pixel - row * self.width, row], -1) * self.pitch - 1
+        return PixelBatch(view, xy, self.rgb[pixel + view[:, None] * (self.height * self.width)])
+
+    def _drawn(self, random: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Views [V], and pixels [V, P] of them, counted row by row."""
+        device, area, own = self.rgb.device, self.height * self.width, slice(self.part, None, self.parts)
         if self.pixels_from is PixelsFrom.rows:
-            return self._rows(random)
+            length = -(-self.width // PIECES)
+            count = self._whole(max(1, round(self.pixels / length)))
+            view = torch.randint(self.n, (count,), generator=random, device=device)
+            within = (torch.rand(count, generator=random, device=device) * (area / count)).long()
+            first = torch.arange(count, device=device) * area // count + within
+            return view[own], ((first[:, None] + torch.arange(length, device=device)) % area)[own]
         if self.pixels_from is PixelsFrom.one_view:
             view, share = torch.randint(self.n, (1,), generator=random, device=device), self._whole(self.pixels)
         elif self.n <= self.pixels:
@@ -64,24 +78,8 @@ class PixelStore:
         else:
             view = torch.randint(self.n, (self._whole(self.pixels),), generator=random, device=device)
             share = 1
-        pixel = torch.randint(self.height * self.width, (len(view), share), generator=random, device=device)
-        if share > 1:
-            pixel = pixel[:, self.part :: self.parts]
-        else:
-            view, pixel = view[self.part :: self.parts], pixel[self.part :: self.parts]
-        row = torch.div(pixel, self.width, rounding_mode="floor")
-        xy = torch.stack([pixel - row * self.width, row], -1) * self.pitch - 1
-        return PixelBatch(view, xy, self.rgb[pixel + view[:, None] * (self.height * self.width)])
-
-    def _rows(self, random: torch.Generator) -> PixelBatch:
-        count, device = self._whole(max(1, round(self.pixels / self.width))), self.rgb.device
-        view = torch.randint(self.n, (count,), generator=random, device=device)
-        spread = torch.arange(count, device=device) + torch.rand(count, generator=random, device=device)
-        row = (spread * (self.height / count)).long().clamp_(max=self.height - 1)
-        view, row = view[self.part :: self.parts], row[self.part :: self.parts]
-        column = torch.arange(self.width, device=device).expand(len(row), -1)
-        xy = torch.stack([column, row[:, None].expand(-1, self.width)], -1) * self.pitch - 1
-        return PixelBatch(view, xy, self.rgb.view(-1, self.width, 3)[view * self.height + row])
+        pixel = torch.randint(area, (len(view), share), generator=random, device=device)
+        return (view, pixel[:, own]) if share > 1 else (view[own], pixel[own])
 
     def _whole(self, count: int) -> int:
         return -(-count // self.parts) * self.parts

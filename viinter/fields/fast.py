@@ -60,7 +60,7 @@ DEEP = 8, 2  # the same for photographs by hand, which take as long; found by tr
 STEP = 4.5  # drawings of its pixels that a training step takes as long as
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
-COMPARED = 4  # one of so many rows of a batch is looked up in another known view
+COMPARED = 4  # one of so many pieces of a batch is looked up in another known view
 PARTNERS = 4  # which is one of so many nearest in motion, in turns
 CONTRAST = 0.14  # rgb: the deviation of colours around a pixel that are `normalized`
 FAINT = 0.01  # rgb: deviations below this may be noise and stay smaller
@@ -331,8 +331,8 @@ class FastField(Field):
 
     def roughness(self, xy: Tensor, seen: Tensor, colour: Tensor) -> Tensor:
         """How much disparity and drift `seen` [S, 2, V, P] differ between pixels that lie side by side, less where
-        `colour` [S, 3, V, P] does too (as in Godard et al. 2017). Of pixels drawn at random few lie so, of rows
-        nearly all."""
+        `colour` [S, 3, V, P] does too (as in Godard et al. 2017). Of pixels drawn at random few lie so, of pieces
+        of rows nearly all."""
         beside = xy.diff(dim=-1).abs().sum(1) < 1.5 * self.pitch
         edge = torch.exp(-EDGE * colour.detach().diff(dim=-1).abs().mean(1))
         return (seen.diff(dim=-1).abs().sum(1) * edge * beside).sum() / seen[:, 0].numel()
