@@ -177,7 +177,7 @@ class OptimConfig:
     lr_decay: float = setting(0.1, "rate at the end, as a share of the first; cosine between (supplement: 0.1)")
     beta2: float = setting(0.999, "Adam's decay of squared gradients (PyTorch's default)")
     batch_pixels: int = setting(8192, "pixels a step, of all devices together (supplement: 8192)")
-    pixels_from: PixelsFrom = setting(PixelsFrom.one_view, "one random view (code), all views, or quarters of rows")
+    pixels_from: PixelsFrom = setting(PixelsFrom.one_view, "one random view (code), all views, or pieces of rows")
 
 
 @dataclass

@@ -17,7 +17,7 @@ from torch import Tensor
 from viinter.config import PixelsFrom
 from viinter.scenes import Scene
 
-PIECES = 4  # of a row, one of which comes from one view (docs/fast.md)
+PIECE = 64  # pixels of a row that come from one view: shorter ones take longer, longer ones teach less (docs/fast.md)
 
 
 class PixelBatch(NamedTuple):
@@ -33,9 +33,10 @@ class PixelStore:
 
     Batch k depends on `seed` and k alone, so that a resumed run goes on with the very batches it would have had.
     `one_view`: `pixels` of one random view (the published code). `all_views`: the same number spread evenly over
-    all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: pieces a quarter of
-    a row long, evenly spread over the frame and each of a random view, as many as come nearest to `pixels`; a field
-    that reads textures finds what it needs of them in the cache. A piece that reaches a row's end goes on in the next.
+    all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: pieces of `PIECE`
+    pixels (at most a row's), evenly spread over the frame and each of a random view, as many as come nearest to
+    `pixels`; a field that reads textures finds what it needs of them in the cache. A piece that reaches a row's end
+    goes on in the next.
 
     Of several processes that train together, `parts`, each gets an equal share of the batch that one alone would have,
     number `part` of them; what is spread is rounded up to a multiple of `parts`.
@@ -65,7 +66,7 @@ class PixelStore:
         """Views [V], and pixels [V, P] of them, counted row by row."""
         device, area, own = self.rgb.device, self.height * self.width, slice(self.part, None, self.parts)
         if self.pixels_from is PixelsFrom.rows:
-            length = -(-self.width // PIECES)
+            length = min(self.width, PIECE)
             count = self._whole(max(1, round(self.pixels / length)))
             view = torch.randint(self.n, (count,), generator=random, device=device)
             within = (torch.rand(count, generator=random, device=device) * (area / count)).long()
