@@ -70,6 +70,7 @@ def test_pieces_of_rows_are_whole_in_order_and_spread_over_the_frame(n, height, 
     pixel, length = row * width + column, min(width, PIECE)
     assert ((pixel.diff(dim=-1) == 1) | (pixel.diff(dim=-1) == 1 - height * width)).all()
     assert pixel.shape == (max(1, round(pixels / length)), length)
+    assert torch.equal(pixel[:, 0], pixel[:, 0].sort().values)
     strata = torch.arange(len(pixel) + 1) * (height * width / len(pixel))  # one from each of so many parts of the frame
     assert (pixel[:, 0] >= strata[:-1].floor()).all()
     assert (pixel[:, 0] <= strata[1:]).all()
