@@ -76,16 +76,18 @@ def test_processes_with_clocks_of_their_own_stop_together_and_go_on(drawn, tmp_p
     process.send_signal(signal.SIGTERM)
     err = process.communicate(timeout=60)[1]
     assert process.returncode == 1
-    said = re.search(r"interrupted at step (\d+); go on with: python -m viinter\.train (resume=.*)", err)
-    assert said, err
-    assert checkpoint_of(tmp_path / "run")["global_step"] == int(said[1]) > 0
+    told = re.findall(r"^interrupted at step (\d+); go on with: python -m viinter\.train (resume=.*)\n", err, re.M)
+    assert len(told) == err.count("interrupted") == 1, err  # the first process alone tells
+    step, resume = int(told[0][0]), told[0][1]
+    assert (tmp_path / "run" / "failure.txt").read_text().startswith(f"KeyboardInterrupt: interrupted at step {step};")
+    assert checkpoint_of(tmp_path / "run")["global_step"] == step > 0
     end = time.monotonic() + 20
     while (left := living(process.pid)) and time.monotonic() < end:
         time.sleep(0.05)
     assert not left
 
     seconds = checkpoint_of(tmp_path / "run")["callbacks"]["Budget"]["training_seconds"] + 0.3
-    found = typed(*command[1:], said[2], f"optim.training_seconds={seconds}", cwd=tmp_path)
+    found = typed(*command[1:], resume, f"optim.training_seconds={seconds}", cwd=tmp_path)
     assert found.returncode == 0, found.stderr
     assert same(*(torch.load(tmp_path / f"rank{k}.pt", weights_only=True) for k in (0, 1)))
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] > int(said[1])
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] > step

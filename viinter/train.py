@@ -14,6 +14,7 @@ import sys
 import timeit
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,8 @@ def train(
         if cfg.logging.pictures:
             show(cfg, scene, module, errors, view_logger.strip, run_dir)
     except SystemExit as ended:
-        if not isinstance(ended.__context__, KeyboardInterrupt):  # submitit's, after it has put the job into the queue
+        # not one of ours: submitit's, after it has put the job into the queue. Of several processes the first tells
+        if not (first and isinstance(ended.__context__, KeyboardInterrupt)):
             raise
         raise KeyboardInterrupt(f"interrupted at step {trainer.global_step}; go on with: {again}") from None
     except DivergenceError:
@@ -331,7 +333,7 @@ def main() -> None:
         others = [a for a in sys.argv[1:] if not a.startswith("resume=")]
         try:
             cfg = config.read_run(resumed[0], others)
-            with failure_noted(Path(resumed[0])):
+            with failure_noted(Path(resumed[0])) if rank_zero_only.rank == 0 else nullcontext():
                 train(cfg, Path(resumed[0]), resume=True)
         except UserError as error:
             sys.exit(f"{type(error).__name__}: {error}")
