@@ -17,7 +17,7 @@ from torch import Tensor
 from viinter.config import PixelsFrom
 from viinter.scenes import Scene
 
-PIECE = 16  # pixels of a row that come together: fewer take longer to gather, more teach less (docs/fast.md)
+PIECE = 64  # pixels of a row that come from one view: shorter ones take longer, longer ones teach less (docs/fast.md)
 
 
 class PixelBatch(NamedTuple):
@@ -33,9 +33,10 @@ class PixelStore:
 
     Batch k depends on `seed` and k alone, so that a resumed run goes on with the very batches it would have had.
     `one_view`: `pixels` of one random view (the published code). `all_views`: the same number spread evenly over
-    all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: so too, but in
-    pieces of `PIECE` pixels of a row (at most a row's), of each view evenly spread over the frame and in order; a field
-    that reads textures finds what it needs of them in the cache. A piece that reaches a row's end goes on in the next.
+    all views (over `pixels` of them, drawn at random, if there are more views than pixels). `rows`: pieces of `PIECE`
+    pixels (at most a row's), evenly spread over the frame and each of a random view, as many as come nearest to
+    `pixels`; a field that reads textures finds what it needs of them in the cache. A piece that reaches a row's end
+    goes on in the next.
 
     Of several processes that train together, `parts`, each gets an equal share of the batch that one alone would have,
     number `part` of them; what is spread is rounded up to a multiple of `parts`.
@@ -64,23 +65,22 @@ class PixelStore:
     def _drawn(self, random: torch.Generator) -> tuple[Tensor, Tensor]:
         """Views [V], and pixels [V, P] of them, counted row by row."""
         device, area, own = self.rgb.device, self.height * self.width, slice(self.part, None, self.parts)
-        rows = self.pixels_from is PixelsFrom.rows
-        length = min(self.width, PIECE) if rows else 1
-        pieces = -(-self.pixels // length)
+        if self.pixels_from is PixelsFrom.rows:
+            length = min(self.width, PIECE)
+            count = self._whole(max(1, round(self.pixels / length)))
+            view = torch.randint(self.n, (count,), generator=random, device=device)
+            within = (torch.rand(count, generator=random, device=device) * (area / count)).long()
+            first = torch.arange(count, device=device) * area // count + within
+            return view[own], ((first[:, None] + torch.arange(length, device=device)) % area)[own]
         if self.pixels_from is PixelsFrom.one_view:
-            view, share = torch.randint(self.n, (1,), generator=random, device=device), self._whole(pieces)
-        elif self.n <= pieces:
-            view, share = self.every_view, self._whole(-(-pieces // self.n))
+            view, share = torch.randint(self.n, (1,), generator=random, device=device), self._whole(self.pixels)
+        elif self.n <= self.pixels:
+            view, share = self.every_view, self._whole(-(-self.pixels // self.n))
         else:
-            view = torch.randint(self.n, (self._whole(pieces),), generator=random, device=device)
+            view = torch.randint(self.n, (self._whole(self.pixels),), generator=random, device=device)
             share = 1
-        if rows:
-            within = (torch.rand(len(view), share, generator=random, device=device) * (area / share)).long()
-            first = torch.arange(share, device=device) * area // share + within
-        else:
-            first = torch.randint(area, (len(view), share), generator=random, device=device)
-        view, first = (view, first[:, own]) if share > 1 else (view[own], first[own])
-        return view, (first[..., None] + torch.arange(length, device=device)).flatten(1) % area
+        pixel = torch.randint(area, (len(view), share), generator=random, device=device)
+        return (view, pixel[:, own]) if share > 1 else (view[own], pixel[own])
 
     def _whole(self, count: int) -> int:
         return -(-count // self.parts) * self.parts

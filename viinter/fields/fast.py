@@ -60,7 +60,7 @@ DEEP = 8, 2  # the same for photographs by hand, which take as long; found by tr
 STEP = 4.5  # drawings of its pixels that a training step takes as long as
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
-COMPARED = 4  # one of so many pixels of a batch is looked up in another known view
+COMPARED = 4  # one of so many pieces of a batch is looked up in another known view
 PARTNERS = 4  # which is one of so many nearest in motion, in turns
 CONTRAST = 0.14  # rgb: the deviation of colours around a pixel that are `normalized`
 FAINT = 0.01  # rgb: deviations below this may be noise and stay smaller
@@ -345,12 +345,14 @@ class FastField(Field):
         the level in training. Of few known views, a mix with that one is drawn too and held to both.
         """
         xy, phi, place, seen = self.drawn
-        rgb, xy, phi, seen = rgb[:, ::COMPARED], xy[..., ::COMPARED], phi[..., ::COMPARED], seen[..., ::COMPARED]
-        places = self.place(codes)
+        some = torch.arange(max(len(view) // COMPARED, 1), device=xy.device) * COMPARED + self.step % COMPARED
+        some %= len(view)
+        view, rgb, xy, phi, place = (part.index_select(0, some) for part in (view, rgb, xy, phi, place))
+        seen, places = seen.index_select(2, some), self.place(codes)
         with torch.no_grad():
             distances = torch.cdist(places.flatten(1), places.flatten(1)).fill_diagonal_(math.inf)
             near = distances.topk(min(PARTNERS, len(codes) - 1), largest=False).indices
-        partner = near[view, (self.step % near.shape[1])[None]]
+        partner = near[view, (self.step // COMPARED % near.shape[1])[None]]
         _, maps = self._maps()
         there, inside = self.found(maps, partner, places, xy, phi, place, seen)
         as_drawn = self.reductions[self.level] == 1 and not self.normalize
