@@ -17,7 +17,7 @@ from torch import Tensor
 from viinter.config import PixelsFrom
 from viinter.scenes import Scene
 
-PIECE = 64  # pixels of a row that come from one view: shorter ones take longer, longer ones teach less (docs/fast.md)
+PIECE = 64  # pixels of a row that come from one view; found by trial (docs/fast_tried.md)
 
 
 class PixelBatch(NamedTuple):

@@ -56,7 +56,7 @@ LATEST = 0.40, 0.65
 ENOUGH = 1500, 60  # steps, and passes over the known pixels: after both more time only learns known views by heart
 FEWEST = 300  # steps for which a budget in seconds should be enough, or sets are left out
 USUAL = 4, 4  # layers of a set, and sets
-DEEP = 8, 2  # the same for photographs by hand, which take as long; found by trial (docs/fast.md)
+DEEP = 8, 2  # the same for photographs by hand, which take as long; found by trial (docs/fast_tried.md)
 STEP = 4.5  # drawings of its pixels that a training step takes as long as
 EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparity step too
 NEAREST = 8  # known views that share in a remainder
@@ -72,7 +72,7 @@ JUDGED = 8  # one of so many rows of the known views says how much each set coun
 
 
 class Pace(NamedTuple):
-    """How a field goes from coarse to fine, found by trial (docs/fast.md).
+    """How a field goes from coarse to fine, found by trial (docs/fast_tried.md).
 
     `coarsest`: pixels of a view's shorter side at the first level, where no motion between views should be far.
     `coarse`, `half`: shares of the budget after which the levels coarser than half size are finished, and that of half
