@@ -1,6 +1,7 @@
 """The fast field: motion, levels, remainders, and a small scene that moves."""
 
 import copy
+import math
 import pickle
 
 import pytest
@@ -44,7 +45,8 @@ def scramble(field: FastField) -> FastField:
 
 def penalty(field: FastField) -> torch.Tensor:
     """Of a field that has not seen the known views, so that it compares nothing."""
-    return field.penalty(torch.zeros(0), torch.zeros(0), torch.zeros(0))
+    xy = field.drawn[0]
+    return field.penalty(torch.zeros(len(xy)).long(), torch.zeros(len(xy), xy.shape[-1], 3), torch.zeros(0))
 
 
 def test_motion_is_linear_in_the_code_so_that_a_mix_moves_half_way():
@@ -335,6 +337,51 @@ def test_a_set_that_went_wrong_loses_its_voice(remainder):
     assert field.trust[1] > 0.999
     middle = codes.mean(0)
     assert torch.allclose(draw(field.eval(), middle, 64, 64), draw(one_set(field, 1), middle, 64, 64), atol=1e-3)
+
+
+def test_a_set_that_is_lost_takes_the_motion_of_the_best():
+    """Before disparities are maps; its layers stay, and so does a set that is hardly worse."""
+    field, xy, z = scramble(make(sets=3)), torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M)
+    field.at(0.0)
+    rgb = torch.rand(2, 50, 3)
+    for _ in range(100):
+        field(xy, z)
+        field.penalty(torch.zeros(2).long(), rgb, z)
+    alone = [(one_set(field, k)(xy, z) - rgb).square().mean().item() for k in range(3)]
+    assert field.errors.tolist() == pytest.approx(alone, rel=1e-3)
+    field.errors.copy_(torch.tensor([1.05, 1.0, 1.1]))
+    for progress in (0.9, 0.0):
+        was = {key: value.clone() for key, value in field.state_dict().items()}
+        field.at(progress)
+        changed = {key for key, value in field.state_dict().items() if not torch.equal(was[key], value)}
+        assert changed == (set() if progress else {"errors", "shift", "bend"})
+    for own in ("errors", "shift", "bend"):
+        assert torch.equal(field.state_dict()[own], was[own][[0, 1, 1]])
+
+
+def test_checkpoints_from_before_sets_were_judged_are_read():
+    field = scramble(make())
+    state = {key: value for key, value in field.state_dict().items() if key != "errors"}
+    other = make()
+    other.load_state_dict(state)
+    assert torch.equal(other.shift, field.shift)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_no_set_of_a_scene_that_slides_goes_wrong(seen, monkeypatch):
+    """One begins to slide the other way, and would not find out by itself."""
+    if not seen:
+        monkeypatch.setattr(fast, "LOST", math.inf)
+    wide, codes = blobs(72, 96, 0, apart=8), random_codes(5, M)
+    views = torch.stack([wide[:, 4:68, 20 - 4 * k : 84 - 4 * k].permute(1, 2, 0) for k in range(5)])
+    field = make(64, 64, views=5, layers=2)
+    field.calibrate(codes)
+    with torch.no_grad():
+        slide = torch.linalg.pinv(codes * field.gain) @ torch.linspace(-0.5, 0.5, 5)
+        field.shift[1, 0] = slide
+        field.shift[0, 0] = -0.5 * slide
+    fit(field, views, codes, steps=200)
+    assert (field.trust.min() > 0.2) == seen
 
 
 @pytest.mark.parametrize(("seconds", "left"), [(2, 1), (16, 1), (18, 2), (33, 2), (35, 4), (3600, 4)])

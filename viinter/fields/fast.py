@@ -69,6 +69,8 @@ FEW = 4  # known views at most, if mixes of their codes are held to them too, an
 GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole parts, spread evenly (Weyl 1916)
 DOUBT = 9  # pixels: within twice as many it is judged how far known views are apart
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
+LOST = 1.07  # times the least error of a set: more, and the set takes the motion of the one that has it
+RECENT = 0.1  # share of the last batch in the errors by which that is judged
 
 
 class Pace(NamedTuple):
@@ -134,6 +136,7 @@ class FastField(Field):
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion + 2))
         self.register_buffer("trust", torch.ones(sets))  # shares of the sets in what is drawn, once finished
+        self.register_buffer("errors", torch.ones(sets))  # of late, of each set while its motion is found
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.register_load_state_dict_pre_hook(FastField._loads)
         self.level = count - 1
@@ -189,18 +192,35 @@ class FastField(Field):
             self.kept.clear()
             self.maps = None
         self.level = level
+        if self.sets > 1 and self.training and not self.mapped():
+            self.regain()
         self.step.fill_(step)
         self.decision.fill_(min(max((progress - half) / 0.3, 0.0), 1.0))
 
     def stage(self) -> int:
         return self.level
 
+    @torch.no_grad()
+    def regain(self) -> None:
+        """Gives sets that are `LOST` the motion of the best. One that went wrong on the coarse levels stays wrong, and
+        its set would have no voice in the end; with layers of its own it makes of the same motion another picture.
+
+        All on the device, which need not be waited for.
+        """
+        errors = self.errors.clone()
+        if torch.distributed.is_initialized():  # each process has seen pixels of its own
+            torch.distributed.all_reduce(errors)
+        lost, best = errors > LOST * errors.min(), errors.argmin()[None]
+        for own in (self.errors, self.shift, self.bend):
+            own.copy_(torch.where(lost.view(-1, *[1] * (own.dim() - 1)), own.index_select(0, best), own))
+
     @staticmethod
     def _loads(field: FastField, state: dict[str, Any], prefix: str, *_: Any) -> None:
-        """Leaves as many sets and layers as the field has that the `state` is of."""
+        """Leaves as many sets and layers as the field has that the `state` is of, which may be an older one."""
         if {f"{prefix}shift", f"{prefix}disparity"} <= set(state):
             sets = max(1, len(state[f"{prefix}shift"]))
             field._leave(sets, len(state[f"{prefix}disparity"]) // sets)
+            state.setdefault(f"{prefix}errors", field.errors)
 
     def _leave(self, sets: int, layers: int) -> None:
         """Drops all but the first sets, and of them all but the first layers. What stays are the same parameters: an
@@ -209,7 +229,7 @@ class FastField(Field):
             return
         for maps in (*self.colours, *self.weights, self.delta, self.disparity):
             maps.data = maps.data.unflatten(0, (self.sets, self.layers))[:sets, :layers].flatten(0, 1).clone()
-        for own in (self.shift, self.bend, self.trust):
+        for own in (self.shift, self.bend, self.trust, self.errors):
             own.data = own.data[:sets].clone()
         self.places = self.places[:, :sets].clone()
         self.sets, self.layers = sets, layers
@@ -295,7 +315,7 @@ class FastField(Field):
         finished = not self.training and bool(self.finished)
         mean = self.mean(each) if finished else each.mean(0)
         if self.training and torch.is_grad_enabled():
-            self.drawn = xy, phi, place, seen
+            self.drawn = xy, phi, place, seen, each.detach()
             undecided = (1 - weight.square().sum(1)).mean()
             self.held = (each - mean).square().mean() + self.decision * self.entropy * undecided
             self.held = self.held + self.smooth * self.roughness(xy, seen, each)
@@ -344,7 +364,7 @@ class FastField(Field):
         Each view is compared with one of those nearest to it in motion, with another at each step, and at the size of
         the level in training. Of few known views, a mix with that one is drawn too and held to both.
         """
-        xy, phi, place, seen = self.drawn
+        xy, phi, place, seen, _ = self.drawn
         some = torch.arange(max(len(view) // COMPARED, 1), device=xy.device) * COMPARED + self.step % COMPARED
         some %= len(view)
         view, rgb, xy, phi, place = (part.index_select(0, some) for part in (view, rgb, xy, phi, place))
@@ -418,6 +438,9 @@ class FastField(Field):
         before, with sets whose layers move as a whole, it sometimes held a motion that was still wrong.
         """
         held, self.held = self.held, None
+        if self.sets > 1 and not self.mapped():
+            error = (self.drawn[-1].movedim(1, -1) + 0.5 - rgb).square().flatten(1).mean(1)
+            self.errors.lerp_(error.to(self.errors.dtype), RECENT)
         if self.known is not None and self.mapped():
             with torch.autocast(rgb.device.type, enabled=False):
                 held = held + self.consistency * self.disagreement(view, rgb.to(self.shift.dtype), codes)
