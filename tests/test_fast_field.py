@@ -349,7 +349,7 @@ def test_a_set_that_is_lost_takes_the_motion_of_the_best():
         field.penalty(torch.zeros(2).long(), rgb, z)
     alone = [(one_set(field, k)(xy, z) - rgb).square().mean().item() for k in range(3)]
     assert field.errors.tolist() == pytest.approx(alone, rel=1e-3)
-    field.errors.copy_(torch.tensor([1.05, 1.0, 1.1]))
+    field.errors.copy_(torch.tensor([1.02, 1.0, 1.04]))
     for progress in (0.9, 0.0):
         was = {key: value.clone() for key, value in field.state_dict().items()}
         field.at(progress)

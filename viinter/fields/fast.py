@@ -69,7 +69,7 @@ FEW = 4  # known views at most, if mixes of their codes are held to them too, an
 GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole parts, spread evenly (Weyl 1916)
 DOUBT = 9  # pixels: within twice as many it is judged how far known views are apart
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
-LOST = 1.07  # times the least error of a set: more, and the set takes the motion of the one that has it
+LOST = 1.03  # times the least error of a set: more, and the set takes the motion of the one that has it
 RECENT = 0.1  # share of the last batch in the errors by which that is judged
 
 
