@@ -22,11 +22,12 @@ views by heart.
 A set's colour is the mean of its layers' colours, weighted by a softmax of their weights: not an alpha compositing,
 which trained more slowly and worse. What is drawn is the mean of the sets, and each is trained to be right by itself:
 where views leave something open, sets settle it differently, and their mean is nearer to the truth than either (as in
-the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. At the end
-they count with the shares that have the least error at the known views: a set that took repeating stripes for their
-neighbours loses its voice. A budget that is too short for all of them has fewer, and the last one fewer layers. Layered
-textures read through a homography are the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX),
-which know the cameras.
+the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. While
+motions are found, on the coarse levels, a set that falls behind takes that of the best. At the end they count with the
+shares that have the least error at the known views: a set that took repeating stripes for their neighbours loses its
+voice. A budget that is too short for all of them has fewer, and the last one fewer layers. Layered textures read
+through a homography are the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the
+cameras.
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
