@@ -426,8 +426,14 @@ class FastField(Field):
         return self.maps
 
     def loss(self, view: Tensor, xy: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
-        """The mean squared error, and the `penalty`."""
-        return super().loss(view, xy, rgb, codes) + self.penalty(view, rgb, codes)
+        """The mean squared error, and the `penalty`; each set's own error goes into `errors`, by which it may `regain`
+        its motion."""
+        loss = super().loss(view, xy, rgb, codes)
+        if self.sets > 1 and not self.mapped():
+            *_, each = self.drawn
+            error = (each.movedim(1, -1) + 0.5 - rgb).square().flatten(1).mean(1)
+            self.errors.lerp_(error.to(self.errors.dtype), RECENT)
+        return loss + self.penalty(view, rgb, codes)
 
     def penalty(self, view: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
         """Four terms on the pixels of the last call.
@@ -439,9 +445,6 @@ class FastField(Field):
         before, with sets whose layers move as a whole, it sometimes held a motion that was still wrong.
         """
         held, self.held = self.held, None
-        if self.sets > 1 and not self.mapped():
-            error = (self.drawn[-1].movedim(1, -1) + 0.5 - rgb).square().flatten(1).mean(1)
-            self.errors.lerp_(error.to(self.errors.dtype), RECENT)
         if self.known is not None and self.mapped():
             with torch.autocast(rgb.device.type, enabled=False):
                 held = held + self.consistency * self.disagreement(view, rgb.to(self.shift.dtype), codes)
