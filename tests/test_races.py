@@ -91,7 +91,27 @@ def test_bench_fast_tells_what_each_reached_and_what_needs_no_training(
     out = capsys.readouterr().out
     assert "along the way" in out
     assert "1/1000" in out
+    assert "Times as fast" in out
+    assert {name: list(of) for name, of in found["times as fast"].items()} == {
+        slow: ["fast, 1/1000 of the time", "fast, 1/60 of the time", "fast, 1/3 of the time"]
+        for slow in ("paper, as published", "paper, tuned")
+    }
     assert ("novel_posed" in out) == (layout == "llff")
+
+
+def test_times_as_fast_compares_the_end_with_the_first_measurement_that_is_as_good():
+    rows = [{"training_seconds": t, "novel_psnr": psnr} for t, psnr in ((2.0, 19.0), (5.0, 21.5), (9.0, 24.0))]
+    quick = runs.Run(Path(), [], rows=rows)
+    slow = {
+        end: runs.Run(Path(), [], metrics={"training_seconds": 100.0, "novel": {"psnr": end}}) for end in (21.0, 25)
+    }
+    assert bench.times_as_fast(quick, slow[21.0]) == 20
+    assert bench.times_as_fast(quick, slow[25]) is None
+
+
+def test_bench_fast_wants_probes(make_config, drawn, tmp_path):
+    with pytest.raises(ConfigError, match="expected a scene with probes; There are no probes"):
+        bench.fast(make_config("pair", drawn("pair")), tmp_path)
 
 
 def test_bench_fast_as_it_is_typed(tmp_path):

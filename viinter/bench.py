@@ -32,6 +32,7 @@ from viinter.evidence import TARGETS, seconds_to
 from viinter.fields.fast import reductions
 from viinter.files import write_json
 from viinter.module import ViewInterpolator, load
+from viinter.runs import Run
 from viinter.train import train
 
 ABOUT = """
@@ -231,10 +232,20 @@ def reached(value: float | None, digits: int = 1) -> str:
     return "not reached" if value is None else f"{value:.{digits}f}"
 
 
+def times_as_fast(run: Run, than: Run) -> float | None:
+    """The training seconds of the run `than` over those after which `run` was first measured at its novel PSNR or
+    above; None if it never was."""
+    seconds = seconds_to(run, than.value("novel", "psnr"))
+    return than.metrics["training_seconds"] / seconds if seconds else None
+
+
 def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     """`races.methods` on one scene and seed, one after another, beside what needs no training; printed as tables, and
-    kept in `bench.json`. `optim.training_seconds` is the time of the published network."""
+    kept in `bench.json`. `optim.training_seconds` is the time of the published network. Raises ConfigError if the scene
+    has no probes."""
     scene = scenes.load(cfg.scene)
+    if not scene.probes["novel"]:
+        raise ConfigError(f"scene.root={cfg.scene.root}: expected a scene with probes; {' '.join(scene.notes)}")
     where = [f"scene.root={cfg.scene.root}", f"scene.downsample={cfg.scene.downsample}"]
     asked = [*typed(), *where, "evaluation.first_seconds=1"]
     found = {}
@@ -262,8 +273,11 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     for slow, part in ((published, parts[0]), (tuned, parts[1])):
         verb = "reaches" if ends[part] >= ends[slow] else "does not reach"
         Console().print(f"{part}: {ends[part]:.2f} dB, {verb} {slow}: {ends[slow]:.2f} dB", highlight=False)
+    ratios = {slow: {part: times_as_fast(found[part], found[slow]) for part in parts} for slow in (published, tuned)}
+    shown("Times as fast to the novel PSNR at the end of (first measurement at or above it)", ["", *ratios],
+          [[part, *(reached(of[part]) for of in ratios.values())] for part in parts])  # fmt: skip
     Console().print(f"curves and pictures: python -m viinter.report {folder}", highlight=False, soft_wrap=True)
-    result = {"novel": ends, "peers": untrained}
+    result = {"novel": ends, "peers": untrained, "times as fast": ratios}
     write_json(folder / "bench.json", result)
     return result
 
