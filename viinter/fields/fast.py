@@ -23,7 +23,8 @@ A set's colour is the mean of its layers' colours, weighted by a softmax of thei
 which trained more slowly and worse. What is drawn is the mean of the sets, and each is trained to be right by itself:
 where views leave something open, sets settle it differently, and their mean is nearer to the truth than either (as in
 the ensembles of Hansen and Salamon 1990). They share the codes, but each has layers and a motion of its own. While
-motions are found, on the coarse levels, a set that falls behind takes that of the best. At the end they count with the
+motions are found, on the coarse levels, a set that falls behind takes that of the best; and before, a field of more and
+smaller textures tries motions from several beginnings, and the best of them are taken. At the end sets count with the
 shares that have the least error at the known views: a set that took repeating stripes for their neighbours loses its
 voice. A budget that is too short for all of them has fewer, and the last one fewer layers. Layered textures read
 through a homography are the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the
@@ -72,6 +73,9 @@ DOUBT = 9  # pixels: within twice as many it is judged how far known views are a
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 LOST = 1.03  # times the least error of a set: more, and the set takes the motion of the one that has it
 RECENT = 0.1  # share of the last batch in the errors by which that is judged
+TRIED = 20  # steps of trials, if with the least of the first level they fit into its share
+WARM = 5  # steps until which they begin, or not at all
+SPARE = 2  # times the layers that a field has, in sets of the usual number, are tried
 
 
 class Pace(NamedTuple):
@@ -99,14 +103,15 @@ class FastField(Field):
     the level in training; those before it are kept as they are, those after it do not take part. A level's weights have
     half the size of its colours; the finest level has none of its own and trains those of the level before.
     `normalize`: known views are compared as they are `normalized`. `doubts`: known views lie in a row, and how far each
-    is from those beside it, where the motion takes it, is kept with its remainder (`judged`). See `config.FastModel`
-    for the other arguments.
+    is from those beside it, where the motion takes it, is kept with its remainder (`judged`). `tries`: twice as many
+    layers first try motions (`attempt`), in a field of their own, which is a `trial`: it has but the first level. See
+    `config.FastModel` for the other arguments.
     """
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
                  margin: float, texture_pixels: int, sharpness: float, entropy: float, smooth: float,
-                 consistency: float, remainder: bool, pace: Pace = STEADY,
-                 normalize: bool = False, doubts: bool = False) -> None:  # fmt: skip
+                 consistency: float, remainder: bool, pace: Pace = STEADY, normalize: bool = False,
+                 doubts: bool = False, tries: bool = True, trial: bool = False) -> None:  # fmt: skip
         super().__init__()
         self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
         self.drawn: tuple[Tensor, ...] = ()
@@ -115,11 +120,11 @@ class FastField(Field):
         self.kept: dict[str, tuple[list, Tensor]] = {}
         self.margin, self.sharpness, self.motion, self.pace = margin, sharpness, motion, pace
         self.entropy, self.smooth, self.consistency, self.normalize = entropy, smooth, consistency, normalize
-        self.doubts = doubts
+        self.doubts, self.trial = doubts, trial
         self.pitch = 2 / width
         self.sets, self.layers = sets, layers
         layers *= sets  # those of a set one after the other
-        self.reductions = reductions(height, width, texture_pixels, pace.coarsest)
+        self.reductions = reductions(height, width, texture_pixels, pace.coarsest)[: 1 if trial else None]
         sizes = [(round(height * margin / by), round(width * margin / by)) for by in self.reductions]
         count = len(sizes)
         self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
@@ -141,6 +146,11 @@ class FastField(Field):
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.register_load_state_dict_pre_hook(FastField._loads)
         self.level = count - 1
+        self.trials, self.tried, self.trying = None, 0, False
+        self.register_buffer("attempts", torch.zeros(2, dtype=torch.long))  # `tried` and `trying`, for a checkpoint
+        if tries and not trial and count > 1:
+            settings = (motion, margin, texture_pixels, sharpness, 0.0, 0.0, 0.0, False, pace)
+            self.trials = FastField(code_dim, 0, height, width, *tried(layers), *settings, trial=True)
         # what changes from step to step is on the device, where a CUDA graph can read it, and so is what is constant
         self.register_buffer("step", torch.zeros((), dtype=torch.long), persistent=False)
         self.register_buffer("decision", torch.ones(()), persistent=False)
@@ -152,17 +162,23 @@ class FastField(Field):
 
     def calibrate(self, codes: Tensor) -> None:
         """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
-        self.gain.copy_(1 / codes.detach().norm(dim=-1).mean().clamp_min(1e-12))
+        for field in self._both():
+            field.gain.copy_(1 / codes.detach().norm(dim=-1).mean().clamp_min(1e-12))
 
     def parameter_groups(self, codes: nn.Parameter) -> list[dict[str, Any]]:
         """Textures, disparity maps, and three groups that move: what is far from 1 in `share` was found by trial."""
+        both = self._both()
         return [
-            {"params": [*self.colours, *self.weights], "share": 1.0},
-            {"params": [self.delta], "share": 0.5},
-            {"params": [self.shift, self.disparity], "share": self.pace.shift},
-            {"params": [self.bend], "share": self.pace.bend},
+            {"params": [maps for field in both for maps in (*field.colours, *field.weights)], "share": 1.0},
+            {"params": [field.delta for field in both], "share": 0.5},
+            {"params": [own for field in both for own in (field.shift, field.disparity)], "share": self.pace.shift},
+            {"params": [field.bend for field in both], "share": self.pace.bend},
             {"params": [codes], "share": 2.5 / self.gain.item()},
         ]
+
+    def _both(self) -> list[FastField]:
+        """The field, and its trials if it has any."""
+        return [self] if self.trials is None else [self, self.trials]
 
     def rates(self) -> list[float]:
         """Whatever moves the textures slows down with the size of their pixels."""
@@ -174,7 +190,8 @@ class FastField(Field):
 
         `Pace` lays the levels over the budget, the finest with most of it, but none before that has more steps than
         `MOST`: textures that are finished before the motion is known hold it where it is. In a short budget they have
-        a larger share, for `LEAST` steps: until the motion is about right finer textures learn nothing. The penalty on
+        a larger share, for `LEAST` steps: until the motion is about right finer textures learn nothing. Where the first
+        level has time for it motions are tried before (`attempt`), and these steps count for no level. The penalty on
         mixed weights is faded in over the finest level's first part: a decision made then is often wrong too.
         """
         self.finished.fill_(False)
@@ -187,8 +204,11 @@ class FastField(Field):
         )
         ends = [early * (k + 1) / coarse for k in range(coarse)] + [half, 1.0]
         most = [MOST[0] * (k + 1) for k in range(coarse)] + [MOST[0] * coarse + MOST[1], math.inf]
+        if self.training:
+            self.attempt(step, (TRIED + LEAST[0]) * a_step <= ends[-count])
+        share, steps = progress - self.tried * a_step, step - self.tried
         stages = zip(ends[-count:], most[-count:], strict=True)
-        level = next((k for k, (end, last) in enumerate(stages) if progress < end and step < last), count - 1)
+        level = next((k for k, (end, last) in enumerate(stages) if share < end and steps < last), count - 1)
         if level != self.level:
             self.kept.clear()
             self.maps = None
@@ -196,10 +216,36 @@ class FastField(Field):
         if self.sets > 1 and self.training and not self.mapped():
             self.regain()
         self.step.fill_(step)
-        self.decision.fill_(min(max((progress - half) / 0.3, 0.0), 1.0))
+        self.decision.fill_(min(max((share - half) / 0.3, 0.0), 1.0))
 
     def stage(self) -> int:
-        return self.level
+        return -1 if self.trying else self.level
+
+    @torch.no_grad()
+    def attempt(self, step: int, affordable: bool) -> None:
+        """Has the `trials` trained in place of the sets for `TRIED` steps, if they are `affordable`, and then gives the
+        sets their best motions. Pixels lead from each beginning to another motion, and which is the best shows early.
+
+        The first step tells nothing of the budget, and in seconds some more take longer than all others.
+        """
+        was, self.tried = self.trying, self.tried if step else 0
+        self.trying = affordable and self.trials is not None and self.tried < TRIED and (was or 0 < step <= WARM)
+        self.tried += self.trying
+        if was or self.trying or not step:
+            for own, value in zip(self.attempts, (self.tried, self.trying), strict=True):
+                own.fill_(value)
+        if was and not self.trying and step:
+            order = self.trials.recent().argsort()
+            best = order[torch.arange(self.sets, device=order.device) % len(order)]
+            for own, found in ((self.shift, self.trials.shift), (self.bend, self.trials.bend)):
+                own.copy_(found.index_select(0, best))
+
+    def recent(self) -> Tensor:
+        """The sets' errors of late [S], of all processes: each has seen pixels of its own."""
+        errors = self.errors.clone()
+        if torch.distributed.is_initialized():
+            torch.distributed.all_reduce(errors)
+        return errors
 
     @torch.no_grad()
     def regain(self) -> None:
@@ -208,9 +254,7 @@ class FastField(Field):
 
         All on the device, which need not be waited for.
         """
-        errors = self.errors.clone()
-        if torch.distributed.is_initialized():  # each process has seen pixels of its own
-            torch.distributed.all_reduce(errors)
+        errors = self.recent()
         lost, best = errors > LOST * errors.min(), errors.argmin()[None]
         for own in (self.errors, self.shift, self.bend):
             own.copy_(torch.where(lost.view(-1, *[1] * (own.dim() - 1)), own.index_select(0, best), own))
@@ -222,6 +266,10 @@ class FastField(Field):
             sets = max(1, len(state[f"{prefix}shift"]))
             field._leave(sets, len(state[f"{prefix}disparity"]) // sets)
             state.setdefault(f"{prefix}errors", field.errors)
+            if f"{prefix}trials.shift" not in state:
+                field.trials = None
+            field.tried, trying = state.setdefault(f"{prefix}attempts", field.attempts).tolist()
+            field.trying = bool(trying)
 
     def _leave(self, sets: int, layers: int) -> None:
         """Drops all but the first sets, and of them all but the first layers. What stays are the same parameters: an
@@ -235,6 +283,9 @@ class FastField(Field):
         self.places = self.places[:, :sets].clone()
         self.sets, self.layers = sets, layers
         self.kept.clear()
+        if self.trials is not None:
+            layers, sets = tried(layers * sets)
+            self.trials._leave(sets, layers)
 
     def textures(self) -> Tensor:
         """Colours and weights [S L, 4, h, w] of the layers at the level in training.
@@ -310,6 +361,8 @@ class FastField(Field):
 
     def _colours(self, xy: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """As `judged`, from `xy` [V, 2, P]."""
+        if self.trying:
+            return self.trials._colours(xy, z)
         place, phi = self.place(z), self.basis(xy)
         each, weight, seen = self.each_set(xy, phi, place)
         # asked only in evaluation: on a GPU the answer must be waited for
@@ -328,7 +381,7 @@ class FastField(Field):
 
     def mapped(self) -> bool:
         """Whether disparities and drifts are maps yet, or each layer still moves as a whole."""
-        return self.level >= min(2, len(self.colours) - 1)
+        return not self.trial and self.level >= min(2, len(self.colours) - 1)
 
     def each_set(self, xy: Tensor, phi: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What each set shows at `xy` [V, 2, P] with `basis` and `place`: its colour less 0.5 [S, 3, V, P], its layers'
@@ -428,6 +481,8 @@ class FastField(Field):
     def loss(self, view: Tensor, xy: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
         """The mean squared error, and the `penalty`; each set's own error goes into `errors`, by which it may `regain`
         its motion."""
+        if self.trying:
+            return self.trials.loss(view, xy, rgb, codes)
         loss = super().loss(view, xy, rgb, codes)
         if self.sets > 1 and not self.mapped():
             *_, each = self.drawn
@@ -567,6 +622,11 @@ def reductions(height: int, width: int, texture_pixels: int, coarsest: int = STE
     shorter side to about `coarsest` pixels to the least that brings the view to `texture_pixels` at most."""
     most = max(0, math.ceil(math.log2(min(height, width) / coarsest)))
     return [2**k for k in range(most, -1, -1) if k == most or height * width <= texture_pixels * 4**k]
+
+
+def tried(layers: int) -> tuple[int, int]:
+    """Layers of a set, and sets, that are tried for a field of so many `layers` in all."""
+    return USUAL[0], max(SPARE, SPARE * layers // USUAL[0])
 
 
 def best_shares(covariance: Tensor) -> Tensor:
