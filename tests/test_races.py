@@ -105,8 +105,8 @@ def test_times_as_fast_compares_the_end_with_the_first_measurement_that_is_as_go
     slow = {
         end: runs.Run(Path(), [], metrics={"training_seconds": 100.0, "novel": {"psnr": end}}) for end in (21.0, 25)
     }
-    assert bench.times_as_fast(quick, slow[21.0]) == 20
-    assert bench.times_as_fast(quick, slow[25]) is None
+    assert races.times_as_fast(quick, slow[21.0]) == 20
+    assert races.times_as_fast(quick, slow[25]) is None
 
 
 def test_bench_fast_wants_probes(make_config, drawn, tmp_path):

@@ -32,7 +32,6 @@ from viinter.evidence import TARGETS, seconds_to
 from viinter.fields.fast import reductions
 from viinter.files import write_json
 from viinter.module import ViewInterpolator, load
-from viinter.runs import Run
 from viinter.train import train
 
 ABOUT = """
@@ -232,13 +231,6 @@ def reached(value: float | None, digits: int = 1) -> str:
     return "not reached" if value is None else f"{value:.{digits}f}"
 
 
-def times_as_fast(run: Run, than: Run) -> float | None:
-    """The training seconds of the run `than` over those after which `run` was first measured at its novel PSNR or
-    above; None if it never was."""
-    seconds = seconds_to(run, than.value("novel", "psnr"))
-    return than.metrics["training_seconds"] / seconds if seconds else None
-
-
 def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     """`races.methods` on one scene and seed, one after another, beside what needs no training; printed as tables, and
     kept in `bench.json`. `optim.training_seconds` is the time of the published network. Raises ConfigError if the scene
@@ -273,7 +265,9 @@ def fast(cfg: TrainConfig, folder: Path) -> dict[str, Any]:
     for slow, part in ((published, parts[0]), (tuned, parts[1])):
         verb = "reaches" if ends[part] >= ends[slow] else "does not reach"
         Console().print(f"{part}: {ends[part]:.2f} dB, {verb} {slow}: {ends[slow]:.2f} dB", highlight=False)
-    ratios = {slow: {part: times_as_fast(found[part], found[slow]) for part in parts} for slow in (published, tuned)}
+    ratios = {
+        slow: {part: races.times_as_fast(found[part], found[slow]) for part in parts} for slow in (published, tuned)
+    }
     shown("Times as fast to the novel PSNR at the end of (first measurement at or above it)", ["", *ratios],
           [[part, *(reached(of[part]) for of in ratios.values())] for part in parts])  # fmt: skip
     Console().print(f"curves and pictures: python -m viinter.report {folder}", highlight=False, soft_wrap=True)

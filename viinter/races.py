@@ -92,6 +92,13 @@ def costs(run: Run, decibel: float) -> dict[str, float | None]:
     }
 
 
+def times_as_fast(run: Run, than: Run) -> float | None:
+    """The training seconds of the run `than` over those after which `run` was first measured at its novel PSNR or
+    above; None if it never was."""
+    seconds = seconds_to(run, than.value("novel", "psnr"))
+    return than.metrics["training_seconds"] / seconds if seconds else None
+
+
 def step_work(height: float, width: float, layers: int, pixels: int) -> dict[str, float]:
     """Operations and bytes of one step of `model=fast` with textures of `height` x `width` (and their margins), and
     milliseconds by memory alone on an H100.

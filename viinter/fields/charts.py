@@ -43,8 +43,8 @@ class ChartedField(Field):
     ) -> None:  # fmt: skip
         super().__init__()
         settings |= {"sets": 1, "texture_pixels": max(1, texture_pixels // MANY), "consistency": HELD * consistency}
-        settings |= {"pace": PACE, "doubts": True, "tries": False}
-        settings |= {"normalize": True}  # a turntable's light does not turn
+        # compared as they are normalized, since a turntable's light does not turn
+        settings |= {"pace": PACE, "tries": False, "doubts": True, "normalize": True}
         self.charts = nn.ModuleList(FastField(code_dim, window, height, width, **settings) for _ in range(views))
         self.window, self.round, self.turn = window, 0, 0
         self.known: Tensor | None = None

@@ -104,8 +104,8 @@ class FastField(Field):
     half the size of its colours; the finest level has none of its own and trains those of the level before.
     `normalize`: known views are compared as they are `normalized`. `doubts`: known views lie in a row, and how far each
     is from those beside it, where the motion takes it, is kept with its remainder (`judged`). `tries`: twice as many
-    layers first try motions (`attempt`), in a field of their own, which is a `trial`: it has but the first level. See
-    `config.FastModel` for the other arguments.
+    layers first try motions (`attempt`), in a field of their own of one level, which is a `trial`: its layers move as
+    wholes. See `config.FastModel` for the other arguments.
     """
 
     def __init__(self, code_dim: int, views: int, height: int, width: int, layers: int, sets: int, motion: int,
@@ -124,7 +124,7 @@ class FastField(Field):
         self.pitch = 2 / width
         self.sets, self.layers = sets, layers
         layers *= sets  # those of a set one after the other
-        self.reductions = reductions(height, width, texture_pixels, pace.coarsest)[: 1 if trial else None]
+        self.reductions = reductions(height, width, texture_pixels, pace.coarsest)
         sizes = [(round(height * margin / by), round(width * margin / by)) for by in self.reductions]
         count = len(sizes)
         self.colours = nn.ParameterList(torch.zeros(layers, 3, max(2, h), max(2, w)) for h, w in sizes)
@@ -148,9 +148,9 @@ class FastField(Field):
         self.level = count - 1
         self.trials, self.tried, self.trying = None, 0, False
         self.register_buffer("attempts", torch.zeros(2, dtype=torch.long))  # `tried` and `trying`, for a checkpoint
-        if tries and not trial and count > 1:
-            settings = (motion, margin, texture_pixels, sharpness, 0.0, 0.0, 0.0, False, pace)
-            self.trials = FastField(code_dim, 0, height, width, *tried(layers), *settings, trial=True)
+        if tries and count > 1:
+            first = (motion, margin, 0, sharpness, 0.0, 0.0, 0.0, False, pace)  # of no pixels: the first level alone
+            self.trials = FastField(code_dim, 0, height, width, *tried(layers), *first, trial=True)
         # what changes from step to step is on the device, where a CUDA graph can read it, and so is what is constant
         self.register_buffer("step", torch.zeros((), dtype=torch.long), persistent=False)
         self.register_buffer("decision", torch.ones(()), persistent=False)
