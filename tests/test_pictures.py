@@ -31,3 +31,19 @@ def test_the_right_axis_has_the_decibels_of_the_error_beside_it(tmp_path, monkey
     for mse, label in ((1e-2, "20"), (1e-3, "30"), (1e-5, "50")):
         assert heights[label] == pytest.approx(axes.transData.transform((1, mse))[1], abs=0.1)
     pictures.plt.close(kept[0])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "labels"), [((27.0, 119.0), ["30", "40", "60", "100"]), ((0.5, 1800.0), ["1", "10", "100", "1000"])]
+)
+def test_seconds_are_said_as_people_say_them(seconds, labels):
+    figure, axes = pictures.plt.subplots()
+    axes.plot(seconds, (1.0, 2.0))
+    pictures.against_seconds(axes)
+    axes.set_xlim(*seconds)
+    figure.canvas.draw()
+    low, high = seconds
+    ticks = axes.xaxis.get_major_ticks() + axes.xaxis.get_minor_ticks()
+    shown = [(tick.get_loc(), tick.label1.get_text()) for tick in ticks]
+    assert [text for at, text in sorted(shown) if low <= at <= high and text] == labels
+    pictures.plt.close(figure)

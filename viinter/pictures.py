@@ -19,7 +19,7 @@ from viinter.views import draw
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogFormatter, NullLocator
 
 ROUNDING = (1 / 255) ** 2 / 12  # mean squared error of rounding to 8 bits
 
@@ -30,6 +30,22 @@ def write_film(
     """`interpolation.mp4` of the codes [F, M], there and back again, so that it plays without a jump."""
     there = [draw(field, z, *size, chunk_pixels).clamp(0, 1).mul(255).round().to("cpu", torch.uint8) for z in codes]
     video.write_mp4(file, (frame / 255 for frame in there + there[-2:0:-1]), fps)
+
+
+class PlainNumbers(LogFormatter):
+    """Labels of a log axis as people say them, 30 and 100; none between the powers of ten where these are many."""
+
+    def __init__(self) -> None:
+        super().__init__(minor_thresholds=(2, 0.6))
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
+def against_seconds(axes: Axes) -> None:
+    """The plot is one against seconds on a log axis."""
+    axes.set_xscale("log")
+    axes.xaxis.set(major_formatter=PlainNumbers(), minor_formatter=PlainNumbers())
 
 
 def end_at_rounding(axes: Axes) -> None:
@@ -46,7 +62,8 @@ def plot_error(file: Path, rows: list[dict[str, Any]], title: str) -> None:
         points = [(r["training_seconds"], r[f"{kind}_mse"]) for r in rows if r[f"{kind}_mse"]]
         if points:
             axes.plot(*zip(*points, strict=True), style, label=f"{kind} views", markersize=4)
-    axes.set(xscale="log", yscale="log", xlabel="training seconds", ylabel="mean squared error", title=title)
+    against_seconds(axes)
+    axes.set(yscale="log", xlabel="training seconds", ylabel="mean squared error", title=title)
     axes.grid(True, which="both", alpha=0.3)
     if axes.lines:
         end_at_rounding(axes)

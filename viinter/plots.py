@@ -13,7 +13,7 @@ from torch import Tensor
 
 from viinter import image
 from viinter.evidence import BUDGET, curve, methods
-from viinter.pictures import end_at_rounding
+from viinter.pictures import against_seconds, end_at_rounding
 from viinter.runs import Run
 from viinter.views import STRIP
 
@@ -106,7 +106,8 @@ def error_curves(runs: list[Run], flat: dict[str, float]) -> Figure:
         if kind == "novel":
             for name, error in flat.items():
                 axes.axhline(error, color="0.3", linestyle=":" if name == "blend" else "--", linewidth=1, label=name)
-        axes.set(xscale="log", yscale="log", xlabel="training seconds", title=f"{kind} views")
+        against_seconds(axes)
+        axes.set(yscale="log", xlabel="training seconds", title=f"{kind} views")
         axes.grid(True, which="both", alpha=0.3)
     both[0].set_ylabel("mean squared error")
     if named := [axes for axes in both if axes.lines]:  # a scene without probes has known views alone
@@ -136,7 +137,8 @@ def work_precision(runs: list[Run], flat: dict[str, float]) -> Figure:
         axes.plot(*zip(*front, strict=True), "o", markersize=11, fillstyle="none", color="black", label="Pareto front")
     for name, psnr in flat.items():
         axes.axhline(psnr, color="0.3", linestyle=":" if name == "blend" else "--", linewidth=1, label=name)
-    axes.set(xscale="log", xlabel="training seconds of the budget", ylabel="novel PSNR, dB")
+    against_seconds(axes)
+    axes.set(xlabel="training seconds of the budget", ylabel="novel PSNR, dB")
     axes.grid(True, which="both", alpha=0.3)
     if axes.lines:
         axes.legend(fontsize=6)
