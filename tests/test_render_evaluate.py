@@ -308,6 +308,14 @@ def test_without_finetune_steps_there_are_no_finetuned_codes(run, tmp_path):
     assert found["novel"]["psnr"] is not None
 
 
+def test_kinds_of_probes_that_a_scene_has_not_are_not_shown(run, tmp_path, capsys):
+    shutil.copytree(run, tmp_path / "run")
+    found = evaluate(EvaluateConfig(run=str(tmp_path / "run"), finetune_steps=0))
+    empty = {kind for kind, values in found.items() if not values["per_view"]}
+    assert empty
+    assert set(re.findall(r"^(\w+) +\d+ views", capsys.readouterr().out, re.M)) == found.keys() - empty
+
+
 def test_an_interrupted_evaluation_goes_on_and_ends_the_same(run, tmp_path, monkeypatch):
     shutil.copytree(run, tmp_path / "run")
     asked = EvaluateConfig(run=str(tmp_path / "run"), finetune_steps=3, finetune_pixels=512, chunk_pixels=4096)

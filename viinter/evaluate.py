@@ -98,6 +98,8 @@ def evaluate(cfg: EvaluateConfig) -> dict[str, Any]:
     write_json(Path(cfg.run) / "evaluation.json", found)
     note.unlink()
     for kind, values in found.items():
+        if not values["per_view"]:  # the scene has no such probes
+            continue
         shown = [f"{values[k]:.{d}f} {unit}" for k, d, unit in (("psnr", 2, "dB"), ("ssim", 4, "SSIM"))
                  if values[k] is not None]  # fmt: skip
         console.print(f"{kind:16} {len(values['per_view']):4} views  {'  '.join(shown)}", highlight=False)
