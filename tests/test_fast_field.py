@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from viinter.codes import lerp
 from viinter.fields import fast
-from viinter.fields.fast import CONTRAST, FastField, best_shares, look_up, normalized
+from viinter.fields.fast import FastField, best_shares
+from viinter.fields.maps import CONTRAST, look_up, normalized
 from viinter.views import draw, pixel_grid
 
 M = 8

@@ -8,7 +8,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "viinter"
 FLOORS = [
     ["config", "files", "image", "video", "codes", "features", "memory", "metrics", "optical_flow", "replay",
-     "fields.field", "fields.paper", "fields.fast", "fields.charts"],
+     "fields.field", "fields.maps", "fields.paper", "fields.fast", "fields.charts"],
     ["scenes"],
     ["data", "module", "views", "peers"],
     ["callbacks", "checkpoints", "guard", "pictures", "step_times", "page", "runs", "comparisons", "evidence", "plots",
@@ -20,7 +20,8 @@ WITHIN = {
     ("files", "config"), ("image", "config"), ("image", "files"), ("video", "config"), ("video", "files"),
     ("optical_flow", "config"), ("optical_flow", "metrics"),
     ("features", "config"), ("fields.paper", "fields.field"), ("fields.fast", "fields.field"),
-    ("fields.charts", "fields.fast"), ("fields.charts", "fields.field"),
+    ("fields.fast", "fields.maps"), ("fields.charts", "fields.fast"), ("fields.charts", "fields.field"),
+    ("fields.charts", "fields.maps"),
     ("module", "data"), ("checkpoints", "callbacks"), ("train", "command"),
     ("evaluate", "command"), ("render", "command"),
     ("download", "command"), ("bench", "command"), ("evaluate", "train"), ("bench", "train"),

@@ -8,7 +8,7 @@ import torch
 
 from viinter import twin
 from viinter.data import PixelBatch
-from viinter.fields import fast
+from viinter.fields import fast, maps
 from viinter.fields.paper import PaperField
 
 PAPER = {"model.width": 128, "model.depth": 5, "model.code_dim": 128}
@@ -46,14 +46,14 @@ def test_the_fast_field_s_gradient_is_off_only_where_a_pixel_lies_on_the_border_
     monkeypatch.setattr(fast, "FEW", few)
     values = {"model.layers": layers, "model.consistency": consistency}
     model, batch = twin.model_and_batch(make_config(**FAST, **values))
-    double, inside, inner = copy.deepcopy(model).double(), {}, fast.sample
+    double, inside, inner = copy.deepcopy(model).double(), {}, maps.sample
 
-    def sample(maps, u):
-        texel = ((u + 1) / 2 * u.new_tensor([[maps.shape[-1] - 1], [maps.shape[-2] - 1]])).floor()
+    def sample(textures, u):
+        texel = ((u + 1) / 2 * u.new_tensor([[textures.shape[-1] - 1], [textures.shape[-2] - 1]])).floor()
         inside.setdefault(u.dtype, []).append(texel.double())
-        return inner(maps, u)
+        return inner(textures, u)
 
-    monkeypatch.setattr(fast, "sample", sample)
+    monkeypatch.setattr(maps, "sample", sample)
     with torch.no_grad():
         for one, dtype in ((model, torch.float32), (double, torch.float64)):
             one(batch.xy.to(dtype), one.codes.weight[batch.view])

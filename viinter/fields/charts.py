@@ -21,8 +21,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from viinter.fields.fast import ENOUGH, FAINT, JUDGED, FastField, Pace
+from viinter.fields.fast import ENOUGH, JUDGED, FastField, Pace
 from viinter.fields.field import Field
+from viinter.fields.maps import FAINT
 
 WINDOW = 3  # views in a chart: the fewest that overlap
 STEPS = 300  # of each chart, if `ENOUGH` passes over its views are not more
