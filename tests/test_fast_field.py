@@ -372,13 +372,13 @@ def test_checkpoints_from_before_sets_were_judged_and_motions_tried_are_read(bef
     assert not other.trying
 
 
-@pytest.mark.parametrize(("steps", "tried"), [(500, 20), (499, 0), (32, 0)])
-def test_the_best_of_the_motions_that_are_tried_are_taken(steps, tried):
-    """If the budget is enough for them; the first step shows whether it is."""
+@pytest.mark.parametrize(("steps", "later", "tried"), [(500, 500, 20), (500, 300, 20), (499, 499, 0), (32, 32, 0)])
+def test_the_best_of_the_motions_that_are_tried_are_taken(steps, later, tried):
+    """If the budget is enough for them; the first step shows whether it is, and none takes back what has begun."""
     field, xy, z, rgb = scramble(make(256, 256, layers=4)), torch.rand(2, 50, 2) * 2 - 1, torch.randn(2, M), 0.5
     begun, trials, found = field.shift.clone(), field.trials, []
     for step in range(30):
-        field.at(step / steps, step)
+        field.at(step / (steps if step < 3 else later), step)
         field.zero_grad(set_to_none=True)
         field.loss(torch.arange(2), xy, torch.full((2, 50, 3), rgb), z).backward()
         trains = field.shift.grad is None

@@ -39,7 +39,7 @@ def test_the_right_axis_has_the_decibels_of_the_error_beside_it(tmp_path, monkey
 def test_seconds_are_said_as_people_say_them(seconds, labels):
     figure, axes = pictures.plt.subplots()
     axes.plot(seconds, (1.0, 2.0))
-    pictures.against_seconds(axes)
+    pictures.plain_log_x(axes)
     axes.set_xlim(*seconds)
     figure.canvas.draw()
     low, high = seconds

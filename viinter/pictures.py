@@ -42,8 +42,8 @@ class PlainNumbers(LogFormatter):
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
-def against_seconds(axes: Axes) -> None:
-    """The plot is one against seconds on a log axis."""
+def plain_log_x(axes: Axes) -> None:
+    """A log axis along x, with `PlainNumbers`."""
     axes.set_xscale("log")
     axes.xaxis.set(major_formatter=PlainNumbers(), minor_formatter=PlainNumbers())
 
@@ -62,7 +62,7 @@ def plot_error(file: Path, rows: list[dict[str, Any]], title: str) -> None:
         points = [(r["training_seconds"], r[f"{kind}_mse"]) for r in rows if r[f"{kind}_mse"]]
         if points:
             axes.plot(*zip(*points, strict=True), style, label=f"{kind} views", markersize=4)
-    against_seconds(axes)
+    plain_log_x(axes)
     axes.set(yscale="log", xlabel="training seconds", ylabel="mean squared error", title=title)
     axes.grid(True, which="both", alpha=0.3)
     if axes.lines:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from viinter import image
 from viinter.evidence import BUDGET, curve, methods
-from viinter.pictures import against_seconds, end_at_rounding
+from viinter.pictures import end_at_rounding, plain_log_x
 from viinter.runs import Run
 from viinter.views import STRIP
 
@@ -72,7 +72,8 @@ def psnr_against(
             if done:
                 points.append((statistics.fmean(x(run) for run in done), _values(done, kind)))
         _with_range(axes, sorted(points), "o-", name)
-    axes.set(xscale="log", xlabel=label, ylabel=f"{kind} PSNR, dB")
+    plain_log_x(axes)
+    axes.set(xlabel=label, ylabel=f"{kind} PSNR, dB")
     axes.grid(True, which="both", alpha=0.3)
     if axes.lines:
         axes.legend(fontsize=8)
@@ -106,7 +107,7 @@ def error_curves(runs: list[Run], flat: dict[str, float]) -> Figure:
         if kind == "novel":
             for name, error in flat.items():
                 axes.axhline(error, color="0.3", linestyle=":" if name == "blend" else "--", linewidth=1, label=name)
-        against_seconds(axes)
+        plain_log_x(axes)
         axes.set(yscale="log", xlabel="training seconds", title=f"{kind} views")
         axes.grid(True, which="both", alpha=0.3)
     both[0].set_ylabel("mean squared error")
@@ -137,7 +138,7 @@ def work_precision(runs: list[Run], flat: dict[str, float]) -> Figure:
         axes.plot(*zip(*front, strict=True), "o", markersize=11, fillstyle="none", color="black", label="Pareto front")
     for name, psnr in flat.items():
         axes.axhline(psnr, color="0.3", linestyle=":" if name == "blend" else "--", linewidth=1, label=name)
-    against_seconds(axes)
+    plain_log_x(axes)
     axes.set(xlabel="training seconds of the budget", ylabel="novel PSNR, dB")
     axes.grid(True, which="both", alpha=0.3)
     if axes.lines:

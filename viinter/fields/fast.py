@@ -71,7 +71,7 @@ DOUBT = 9  # pixels: within twice as many it is judged how far known views are a
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 LOST = 1.03  # times the least error of a set: more, and the set takes the motion of the one that has it
 RECENT = 0.1  # share of the last batch in the errors by which that is judged
-TRIED = 20  # steps of trials, if with the least of the first level they fit into its share
+TRIED = 20  # steps of trials, if with the least of the first level they seem to fit into its share when they begin
 WARM = 5  # steps until which they begin, or not at all
 SPARE = 2  # times the layers that a field has, in sets of the usual number, are tried
 
@@ -221,13 +221,15 @@ class FastField(Field):
 
     @torch.no_grad()
     def attempt(self, step: int, affordable: bool) -> None:
-        """Has the `trials` trained in place of the sets for `TRIED` steps, if they are `affordable`, and then gives the
-        sets their best motions. Pixels lead from each beginning to another motion, and which is the best shows early.
+        """Has the `trials` trained in place of the sets for `TRIED` steps, and then gives the sets their best motions.
+        Pixels lead from each beginning to another motion, and which is the best shows early, but not at once.
 
-        The first step tells nothing of the budget, and in seconds some more take longer than all others.
+        They begin as soon as they are `affordable`, and then go on. The first step tells nothing of the budget, and in
+        seconds some more take longer than all others.
         """
         was, self.tried = self.trying, self.tried if step else 0
-        self.trying = affordable and self.trials is not None and self.tried < TRIED and (was or 0 < step <= WARM)
+        begins = affordable and 0 < step <= WARM
+        self.trying = self.trials is not None and self.tried < TRIED and (was or begins)
         self.tried += self.trying
         if was or self.trying or not step:
             for own, value in zip(self.attempts, (self.tried, self.trying), strict=True):

@@ -1,6 +1,7 @@
 """Pictures and textures as maps: as sums of levels, read between their pixels, compared around them.
 
-Notation: `N` maps of `C` channels, [N, C, h, w]; `n` images [n, h, w, 3]; `V` views of `P` pixels each.
+Notation: `N` maps of `C` channels, [N, C, h, w], or those of `S` sets of `L` layers; `n` images [n, h, w, 3]; `V` views
+of `P` pixels each.
 """
 
 from __future__ import annotations
