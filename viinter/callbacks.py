@@ -265,7 +265,8 @@ class ErrorClock(L.Callback):
     still meanwhile. Each gives a row of `error_vs_time.csv` and scalars in TensorBoard.
 
     If the known views then have more than `LOST` times their least error so far, it warns: too high a rate takes a sine
-    network back to one flat colour, with every number finite.
+    network back to one flat colour, with every number finite. Errors of one `Field.stage` are compared: another may
+    begin anew.
 
     One comes at the end always. Where a view takes so long to draw that it would take more than is left of
     `max_share`, and more than `LAST_SECONDS`, only one of `every[kind]` views of each kind, evenly spaced, is measured
@@ -277,6 +278,8 @@ class ErrorClock(L.Callback):
         self.rows: list[dict[str, Any]] = []
         self.next, self.spent, self.longest = cfg.first_seconds, 0.0, 0.0
         self.one = 0.0  # seconds for a view
+        self.stage: int | None = None
+        self.since = 0  # rows of the stages before
         self.final: dict[str, dict] = {}
         self.every: dict[str, int] = {}
         self.listeners: list[Callable[[str, int, Tensor, Tensor], None]] = []
@@ -349,6 +352,10 @@ class ErrorClock(L.Callback):
                 row |= {f"{kind}_{key}": found[kind][key] for key in ("mse", "psnr", "ssim")}
             row |= {"code_norm_min": norms.min().item(), "code_norm_max": norms.max().item()}
             row["lr"] = trainer.optimizers[0].param_groups[0]["lr"]
+            stage = module.field.stage()
+            if self.stage not in (None, stage):
+                self.since = len(self.rows)
+            self.stage = stage
             self.rows.append(row)
             self._write(trainer.logger.experiment, row)
             self._warn_of_loss(trainer)
@@ -357,7 +364,7 @@ class ErrorClock(L.Callback):
         return found
 
     def _warn_of_loss(self, trainer: L.Trainer) -> None:
-        *before, now = self.rows
+        *before, now = self.rows[self.since :]
         if before and trainer.is_global_zero:
             best = min(before, key=lambda row: row["known_mse"])
             if before[-1]["known_mse"] <= LOST * best["known_mse"] < now["known_mse"]:
