@@ -580,9 +580,15 @@ def test_rows_of_before_an_interruption_stay_in_the_table(make_config, tmp_path)
         assert all(float(a[key]) < float(b[key]) for a, b in itertools.pairwise(table))
 
 
-@pytest.mark.parametrize(("stages", "warned"), [([0] * 8, ["24", "27"]), ([-1] * 3 + [0] * 5, ["45", "67"])])
+@pytest.mark.parametrize(
+    ("stages", "first", "warned"),
+    [
+        ([0] * 8, "20.0 dB at step 2 and have 16.8 at step 4", ["24", "27"]),
+        ([-1] * 3 + [0] * 5, "16.8 dB at step 4 and have 13.0 at step 5", ["45", "67"]),
+    ],
+)
 def test_known_views_that_get_worse_by_half_are_warned_of_once(
-    stages, warned, make_config, tmp_path, stopwatch, monkeypatch, caplog
+    stages, first, warned, make_config, tmp_path, stopwatch, monkeypatch, caplog
 ):
     """In each stage of the field: what one has learned another may begin anew, as trials of motions do."""
     monkeypatch.setattr(PaperField, "stage", lambda self: stages[len(known) - 1])
@@ -601,9 +607,19 @@ def test_known_views_that_get_worse_by_half_are_warned_of_once(
     assert not list(errors)
     said = [r.message for r in caplog.records if r.name == "viinter"]
     assert [re.findall(r"at step (\d)", message) for message in said] == [list(steps) for steps in warned]
-    if warned == ["24", "27"]:
-        assert said[0].startswith("the known views had 20.0 dB at step 2 and have 16.8 at step 4: what was learned")
+    assert said[0].startswith(f"the known views had {first}: what was learned")
     assert re.search(r"a lower optim.lr \(now [\d.e-]+\) may help$", said[0])
+
+
+def test_a_clock_that_goes_on_knows_where_the_stage_began(make_config, tmp_path):
+    """And one from before stages were told apart has one."""
+    cfg = make_config()
+    was, now, before = (ErrorClock(cfg.evaluation, scenes.load(cfg.scene), Clock(), tmp_path) for _ in range(3))
+    was.rows, was.stage, was.since = [{"step": 1}, {"step": 2}], 0, 1
+    now.load_state_dict(was.state_dict())
+    assert (now.rows, now.stage, now.since) == (was.rows, 0, 1)
+    before.load_state_dict({key: value for key, value in was.state_dict().items() if key not in ("stage", "since")})
+    assert (before.rows, before.stage, before.since) == (was.rows, None, 0)
 
 
 def test_a_scene_without_probes_has_empty_novel_columns(make_config, tmp_path):

@@ -390,11 +390,13 @@ class ErrorClock(L.Callback):
                 board.add_scalar(tag, value, row["step"])
 
     def state_dict(self) -> dict[str, Any]:
-        return {"rows": self.rows, "next": self.next, "spent": self.spent, "longest": self.longest}
+        measured = {"rows": self.rows, "stage": self.stage, "since": self.since}
+        return {**measured, "next": self.next, "spent": self.spent, "longest": self.longest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.rows, self.next = state["rows"], state["next"]
         self.spent, self.longest = state["spent"], state["longest"]
+        self.stage, self.since = state.get("stage"), state.get("since", 0)
 
 
 class ViewLogger(L.Callback):
