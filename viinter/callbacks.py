@@ -111,20 +111,26 @@ class Budget(L.Callback):
     The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end. The
     field is told where the budget stands before each step, and settles and finishes on the clock: see
     `fields.field.Field`. The seconds that finishing will take are kept back from the steps, but half of the training
-    seconds at most; the schedule is laid over those from the first step to there. Training seconds that are more than
-    the field has a use for are left over.
+    seconds at most; the schedule is laid over those from the first step to there. A step that would end beyond them, if
+    it took as long as the one before, is not begun. Training seconds that are more than the field has a use for are
+    left over.
     """
 
     def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
         self.cfg, self.clock, self.begun, self.kept_back, self.enough = cfg, clock, 0.0, 0.0, math.inf
+        self.ended = 0.0  # the last step, in training seconds
+
+    def used(self, trainer: L.Trainer, ahead: float = 0.0) -> float:
+        """The share of the budget that is used, or will be `ahead` seconds from now; above 1 beyond its end."""
+        if (seconds := self.cfg.training_seconds) is None:
+            return trainer.global_step / self.cfg.steps
+        stepping = seconds - min(self.kept_back, seconds / 2) - self.begun
+        used = (self.clock.seconds + ahead - self.begun) / stepping if stepping > 0 else 1.0
+        return max(used, trainer.global_step / self.enough)
 
     def progress(self, trainer: L.Trainer) -> float:
         """The share of the budget that is used, in [0, 1]."""
-        if (seconds := self.cfg.training_seconds) is not None:
-            stepping = seconds - min(self.kept_back, seconds / 2) - self.begun
-            used = (self.clock.seconds - self.begun) / stepping if stepping > 0 else 1.0
-            return min(max(used, trainer.global_step / self.enough), 1.0)
-        return min(trainer.global_step / self.cfg.steps, 1.0)
+        return min(self.used(trainer), 1.0)
 
     def factor(self, progress: float) -> float:
         """The rate at `progress`, as a share of the first."""
@@ -141,6 +147,7 @@ class Budget(L.Callback):
                 seconds, store.n, batch, lambda: agreed(trainer, seconds_to_draw(module, store.height, store.width))
             )
             self.begun = self.clock.seconds
+        self.ended = self.clock.seconds
         trainer.should_stop = agreed(trainer, self.progress(trainer)) >= 1
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
@@ -151,7 +158,9 @@ class Budget(L.Callback):
             group["lr"] = group["initial_lr"] * factor * rate
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        if agreed(trainer, self.progress(trainer)) >= 1:
+        before, self.ended = self.ended, self.clock.seconds
+        step = self.ended - before if trainer.global_step > 1 else 0.0  # the first takes longer than those after it
+        if agreed(trainer, self.used(trainer) >= 1 or self.used(trainer, step) > 1):
             trainer.should_stop = True
 
     def on_train_end(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
