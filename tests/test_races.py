@@ -1,7 +1,10 @@
 """Trainings side by side: what they are, what they cost, and the benches that print them."""
 
 import json
+import shutil
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -41,20 +44,35 @@ def test_a_block_of_a_grid_has_the_files_among_its_first_known_views(tmp_path):
         races.block(tmp_path / "other", 3, tmp_path / "nothing")
 
 
-def test_a_training_is_a_command_that_is_not_repeated_and_whose_failure_is_told(tmp_path, capfd):
+@pytest.fixture
+def quick(monkeypatch, command_line):
+    """Commands that `races` gives are typed through `command_line`; what they said on standard error."""
+    said = []
+
+    def run(command):
+        assert command[:2] == [sys.executable, "-m"]
+        done = command_line(*command[2:], cwd=Path.cwd())
+        said.append(done.err)
+        return SimpleNamespace(returncode=done.code)
+
+    monkeypatch.setattr(races, "subprocess", SimpleNamespace(run=run))
+    return said
+
+
+def test_a_training_is_a_command_that_is_not_repeated_and_whose_failure_is_told(tmp_path, quick):
     common = ["scale=smoke", "scene=folder", f"scene.root={grid(tmp_path / 'views', 2)}", "logging.pictures=false"]
     found = races.train(tmp_path / "run", ["model=fast", "optim.steps=3"], common)
     assert found.metrics["steps"] == 3
-    before = (tmp_path / "run" / "metrics.json").stat().st_mtime_ns
     races.train(tmp_path / "run", ["model=fast", "optim.steps=3"], common)
-    assert (tmp_path / "run" / "metrics.json").stat().st_mtime_ns == before
+    assert len(quick) == 1
     (tmp_path / "run" / "metrics.json").unlink()  # as if it had been killed before its end
     assert races.train(tmp_path / "run", ["model=fast", "optim.steps=3"], common).metrics["steps"] == 3
+    assert len(quick) == 2
     with pytest.raises(UserError, match=r"holds a run of .* model=fast optim\.steps=3, not of .* optim\.steps=4;"):
         races.train(tmp_path / "run", ["model=fast", "optim.steps=4"], common)
     with pytest.raises(UserError, match=r"viinter\.train .* optim\.steps=x .* failed"):
         races.train(tmp_path / "other", ["model=fast", "optim.steps=x"], common)
-    assert "optim.steps" in capfd.readouterr().err
+    assert "optim.steps" in quick[-1]
 
 
 @pytest.fixture
@@ -114,14 +132,22 @@ def test_bench_fast_wants_probes(make_config, drawn, tmp_path):
         bench.fast(make_config("pair", drawn("pair")), tmp_path)
 
 
-def test_bench_fast_as_it_is_typed(tmp_path):
+def test_an_interrupted_race_goes_on_as_it_is_typed(tmp_path, make_config, quick, monkeypatch):
     root = grid(tmp_path / "grid", 2)
     settings = ["scene=planar", f"scene.root={root}", "scale=smoke", "threads=1", "logging.pictures=false"]
+    folder, last = tmp_path / "bench", "fast_1_3_of_the_time"
+    with monkeypatch.context() as here:
+        here.setattr(bench, "typed", lambda: [s for s in settings if not s.startswith("scene.root")])
+        bench.fast(make_config("planar", root, **{"optim.training_seconds": 0.3}), folder)
+    assert len(quick) == 5
+    before = {run.name: (run / "metrics.json").stat().st_mtime_ns for run in folder.iterdir() if run.is_dir()}
+    shutil.rmtree(folder / last)
     done = typed("-m", "viinter.bench", "fast", *settings, "optim.training_seconds=0.3", "hydra.run.dir=bench",
                  cwd=tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "fast, 1/60 of the time:" in done.stdout
-    assert len(list((tmp_path / "bench").glob("*/metrics.json"))) == 5
+    after = {run.name: (run / "metrics.json").stat().st_mtime_ns for run in folder.iterdir() if run.is_dir()}
+    assert {name for name in before if before[name] != after[name]} == {last}
 
 
 def test_bench_scaling_measures_three_numbers_and_three_sizes(make_config, tmp_path, here, capsys):
