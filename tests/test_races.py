@@ -136,17 +136,21 @@ def test_an_interrupted_race_goes_on_as_it_is_typed(tmp_path, make_config, quick
     root = grid(tmp_path / "grid", 2)
     settings = ["scene=planar", f"scene.root={root}", "scale=smoke", "threads=1", "logging.pictures=false"]
     folder, last = tmp_path / "bench", "fast_1_3_of_the_time"
+
+    def written():
+        return {run.name: (run / "metrics.json").stat().st_mtime_ns for run in folder.iterdir() if run.is_dir()}
+
     with monkeypatch.context() as here:
         here.setattr(bench, "typed", lambda: [s for s in settings if not s.startswith("scene.root")])
         bench.fast(make_config("planar", root, **{"optim.training_seconds": 0.3}), folder)
     assert len(quick) == 5
-    before = {run.name: (run / "metrics.json").stat().st_mtime_ns for run in folder.iterdir() if run.is_dir()}
+    before = written()
     shutil.rmtree(folder / last)
     done = typed("-m", "viinter.bench", "fast", *settings, "optim.training_seconds=0.3", "hydra.run.dir=bench",
                  cwd=tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "fast, 1/60 of the time:" in done.stdout
-    after = {run.name: (run / "metrics.json").stat().st_mtime_ns for run in folder.iterdir() if run.is_dir()}
+    after = written()
     assert {name for name in before if before[name] != after[name]} == {last}
 
 

@@ -118,7 +118,7 @@ class Budget(L.Callback):
 
     def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
         self.cfg, self.clock, self.begun, self.kept_back, self.enough = cfg, clock, 0.0, 0.0, math.inf
-        self.ended = 0.0  # the last step, in training seconds
+        self.ended: float | None = None  # the last step since training began or went on, in training seconds
 
     def used(self, trainer: L.Trainer, ahead: float = 0.0) -> float:
         """The share of the budget that is used, or will be `ahead` seconds from now; above 1 beyond its end."""
@@ -147,7 +147,6 @@ class Budget(L.Callback):
                 seconds, store.n, batch, lambda: agreed(trainer, seconds_to_draw(module, store.height, store.width))
             )
             self.begun = self.clock.seconds
-        self.ended = self.clock.seconds
         trainer.should_stop = agreed(trainer, self.progress(trainer)) >= 1
 
     def on_train_batch_start(self, trainer: L.Trainer, module: ViewInterpolator, batch: Any, batch_idx: int) -> None:
@@ -159,7 +158,7 @@ class Budget(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         before, self.ended = self.ended, self.clock.seconds
-        step = self.ended - before if trainer.global_step > 1 else 0.0  # the first takes longer than those after it
+        step = 0.0 if before is None else self.ended - before  # the first takes longer than those after it
         if agreed(trainer, self.used(trainer) >= 1 or self.used(trainer, step) > 1):
             trainer.should_stop = True
 
