@@ -301,10 +301,11 @@ def test_finetuning_does_not_touch_the_model_in_memory(run, monkeypatch):
     assert all(p.grad is None for p in models[0].parameters())
 
 
-def test_without_finetune_steps_there_are_no_finetuned_codes(run, tmp_path):
+def test_without_finetune_steps_there_are_no_finetuned_codes(run, tmp_path, capsys):
     shutil.copytree(run, tmp_path / "run")
     found = evaluate(EvaluateConfig(run=str(tmp_path / "run"), finetune_steps=0))
     assert "finetuned" not in found
+    assert "finetuning codes" not in capsys.readouterr().out
     assert found["novel"]["psnr"] is not None
 
 

@@ -151,6 +151,8 @@ def finetune(
     Yields:
         n of the probes, until all have been, and their codes [n, M].
     """
+    if not probes:  # and no bar for them
+        return
     first = cfg.finetune_lr * codes.square().mean().sqrt().item()
     many = max(1, cfg.chunk_pixels // (GRADIENTS * cfg.finetune_pixels))
     groups = [probes[k : k + many] for k in range(0, len(probes), many)]
