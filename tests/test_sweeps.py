@@ -113,7 +113,7 @@ def test_the_papers_scenes_are_one_sweep_and_those_that_are_not_there_are_shown_
 
 def test_the_feature_towers_are_one_sweep(command_line, archive, vgg_weights, tmp_path):
     chosen = ["experiment=features", f"paths.data={archive}", "tower=none,vgg16", f"features.weights={vgg_weights}"]
-    found, done = sweep(command_line, tmp_path, *chosen, "features.patches=cover", *TINY)
+    found, done = sweep(command_line, tmp_path, *chosen, *TINY)
     assert (found.code, len(done)) == (0, 2), found.err
     assert [setting(folder, "interpolation.alpha") for folder in done] == [0, 0.05]
     assert metrics(done[0])["known"]["mse"] != metrics(done[1])["known"]["mse"]
