@@ -17,7 +17,7 @@ SETTINGS = [
     "scale=smoke", "model.code_dim=8", "trainer.accelerator=cpu", "threads=1", "logging.progress=false",
     "logging.pictures=false", "hydra.run.dir=run",
 ]  # fmt: skip
-WITH_TOWER = ["interpolation.alpha=0.01", "features.extractor=tiny", "features.patches=cover"]
+WITH_TOWER = ["interpolation.alpha=0.01", "features.extractor=tiny"]
 
 
 def close(a, b):
