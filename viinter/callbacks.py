@@ -34,6 +34,7 @@ from viinter.module import ViewInterpolator
 from viinter.scenes import Scene
 from viinter.views import STRIP, draw, draw_strip, measure, pixel_grid
 
+HEADROOM = 1.5  # times the seconds that finishing should take are kept back: a machine's pace varies by so much
 LAST_SECONDS = 30.0  # that the last measurement may take however short a run was
 LOST = 2.0  # times the least error of the known views so far: from there on what was learned is being lost
 
@@ -110,10 +111,10 @@ class Budget(L.Callback):
 
     The rate goes from `lr` to `lr * lr_decay` (supplement: 1e-5 to 1e-6) and stays there past the end. The
     field is told where the budget stands before each step, and settles and finishes on the clock: see
-    `fields.field.Field`. The seconds that finishing will take are kept back from the steps, but half of the training
-    seconds at most; the schedule is laid over those from the first step to there. A step that would end beyond them, if
-    it took as long as the one before, is not begun. Training seconds that are more than the field has a use for are
-    left over.
+    `fields.field.Field`. `HEADROOM` times the seconds that finishing will take are kept back from the steps, but half
+    of the training seconds at most; the schedule is laid over those from the first step to there. A step that would end
+    beyond them, if it took as long as the one before, is not begun. Training seconds that are more than the field has a
+    use for are left over.
     """
 
     def __init__(self, cfg: OptimConfig, clock: Clock) -> None:
@@ -143,7 +144,7 @@ class Budget(L.Callback):
         batch = self.cfg.batch_pixels / (store.height * store.width)
         self.enough = module.field.enough(store.n / batch)
         if (seconds := self.cfg.training_seconds) is not None and not trainer.global_step:
-            self.kept_back = module.field.settle(
+            self.kept_back = HEADROOM * module.field.settle(
                 seconds, store.n, batch, lambda: agreed(trainer, seconds_to_draw(module, store.height, store.width))
             )
             self.begun = self.clock.seconds
