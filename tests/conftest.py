@@ -302,7 +302,7 @@ def fit(field: Field, views: torch.Tensor, codes: torch.nn.Parameter, steps: int
     """Trains on rows of the square `views` [n, H, H, 3], as `viinter.train` does, and finishes."""
     size = views.shape[1]
     field.calibrate(codes)
-    field.see(views)
+    field.see(views, codes)
     groups = field.parameter_groups(codes)
     optimizer = torch.optim.Adam([{"params": g["params"], "lr": 0.02 * g["share"]} for g in groups], betas=(0.9, 0.99))
     first = [g["lr"] for g in optimizer.param_groups]

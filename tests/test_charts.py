@@ -87,7 +87,7 @@ def test_a_step_trains_one_chart_on_its_own_views_and_leaves_the_codes():
     field, codes = make(5, consistency=0.0, smooth=0.0, entropy=0.0), random_codes(5, M)
     field.calibrate(codes)
     colours = torch.arange(5.0)[:, None, None, None].expand(5, 32, 32, 3)
-    field.see(colours)
+    field.see(colours, codes)
     view = torch.arange(32) % 3
     xy = torch.stack(torch.meshgrid(torch.arange(32), torch.arange(32), indexing="xy"), -1) / 16 - 1
     for step in range(10):

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from viinter.codes import lerp
 from viinter.fields import fast
-from viinter.fields.fast import FastField, best_shares
+from viinter.fields.fast import FastField, best_shares, principal
 from viinter.fields.maps import CONTRAST, look_up, normalized
 from viinter.views import draw, pixel_grid
 
 M = 8
 
 
-def make(height: int = 64, width: int = 64, views: int = 2, **changes) -> FastField:
+def make(height: int = 64, width: int = 64, views: int = 2, code_dim: int = M, **changes) -> FastField:
     torch.manual_seed(0)
     settings = {"layers": 3, "sets": 2, "motion": 6, "margin": 1.1, "texture_pixels": 2**18, "sharpness": 5.0,
                 "entropy": 1e-3, "smooth": 0.0, "consistency": 1.0, "remainder": True} | changes  # fmt: skip
-    return FastField(M, views, height, width, **settings)
+    return FastField(code_dim, views, height, width, **settings)
 
 
 def one_set(field: FastField, k: int) -> FastField:
@@ -89,7 +89,7 @@ def disagreement(field: FastField, views: torch.Tensor, slide: float) -> torch.T
     """That of the two `views` [2, 128, 128, 3] if all that is seen in the first is `slide` pixels to the left in the
     second."""
     codes = torch.nn.Parameter(torch.stack([torch.zeros(M), torch.eye(M)[0]]))
-    field.see(views)
+    field.see(views, codes)
     rows = pixel_grid(128, 128).view(128, 128, 2)[::16]
     view = torch.arange(8) // 4
     with torch.no_grad():
@@ -149,7 +149,7 @@ def test_between_two_views_a_colour_of_either_is_right_and_no_other():
     field.step.fill_(1)
 
     def between(*colours: float) -> torch.Tensor:
-        field.see(torch.tensor(colours).view(2, 1, 1, 1).expand(2, 64, 64, 3))
+        field.see(torch.tensor(colours).view(2, 1, 1, 1).expand(2, 64, 64, 3), codes)
         field.kept.clear()
         return field.between(torch.tensor([0]), torch.tensor([1]), xy, phi, places)
 
@@ -165,7 +165,7 @@ def test_only_few_known_views_have_mixes_held_to_them(count, monkeypatch):
     inner = FastField.between
     monkeypatch.setattr(FastField, "between", lambda *a: drawn.append(a) or inner(*a))
     field, codes, views = make(views=count), torch.randn(count, M), torch.rand(count, 64, 64, 3)
-    field.see(views)
+    field.see(views, codes)
     view = torch.arange(count)
     field(pixel_grid(64, 64).expand(count, -1, -1), codes)
     assert field.penalty(view, views.flatten(1, 2), codes) > 0
@@ -175,11 +175,97 @@ def test_only_few_known_views_have_mixes_held_to_them(count, monkeypatch):
 def test_what_nothing_is_seen_of_is_not_compared():
     """A single view has no partner; with consistency=0 no view has one."""
     for field, views in ((make(), torch.rand(1, 64, 64, 3)), (make(consistency=0.0), torch.rand(2, 64, 64, 3))):
-        field.see(views)
         codes = torch.randn(len(views), M)
+        field.see(views, codes)
         field(pixel_grid(64, 64)[None], codes[:1])
         alone = field.held.detach()
         assert torch.equal(field.penalty(torch.zeros(1).long(), views[:1].flatten(1, 2), codes), alone)
+
+
+def from_a_grid(side: int, step: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Views [side^2, 64, 64, 3] of one blob that moves by `step` pixels between neighbours, and where [side^2, 2]."""
+    places = torch.cartesian_prod(torch.arange(side), torch.arange(side)).float() - (side - 1) / 2
+    x = torch.arange(64.0) - 31.5
+    column, row = (torch.exp(-((x - step * at[:, None]) ** 2) / 200) for at in places.unbind(1))
+    return (row[:, :, None] * column[:, None])[..., None].expand(-1, -1, -1, 3), places
+
+
+@given(n=st.integers(5, 12), dim=st.integers(1, 4), seed=st.integers(0, 2**16))
+def test_principal_coordinates_are_those_of_the_directions_in_which_points_differ(n, dim, seed):
+    """As many as have a tenth of the first one's variance, three at least."""
+    random = torch.Generator().manual_seed(seed)
+    inner = torch.linalg.qr(torch.randn(n, dim, generator=random).double()).Q
+    inner = inner - inner.mean(0)
+    turned = inner @ torch.linalg.qr(torch.randn(9, dim, generator=random).double()).Q.T
+    places = principal(turned + torch.randn(9, generator=random))
+    variances = torch.linalg.svdvals(inner).square()
+    assert places.shape[1] == max(3, (variances > 0.1 * variances[0]).sum())
+    assert places.square().sum(1).mean() == pytest.approx(1)
+    if dim <= 3:  # all distances are kept, up to one factor
+        apart, expected = torch.pdist(places), torch.pdist(inner)
+        assert torch.allclose(apart / apart.norm(), expected / expected.norm(), atol=1e-6)
+
+
+def test_principal_coordinates_of_points_that_are_all_alike_are_nothing():
+    assert not principal(torch.full((5, 7), 0.3)).any()
+
+
+def trying(side: int) -> tuple[FastField, torch.nn.Parameter, torch.Tensor, torch.Tensor]:
+    """A field that begins to try motions for views `from_a_grid`; their codes, they themselves, and where they are."""
+    field, codes = make(views=side**2, code_dim=32), random_codes(side**2, 32)
+    views, places = from_a_grid(side, 1.0)
+    field.calibrate(codes)
+    field.see(views, codes)
+    field.at(0.0, 0)
+    field.at(1e-3, 1)
+    assert field.trying
+    return field, codes, views, places
+
+
+@pytest.mark.parametrize("side", [3, 5])
+def test_motions_that_are_tried_begin_linear_in_where_views_are_from(side):
+    """Nobody says where: it is seen in the views themselves."""
+    field, codes, _, places = trying(side)
+    linear = torch.cat([places, torch.ones(len(places), 1)], 1)
+    motion = field.trials.place(codes).detach().flatten(1)
+    left = motion - linear @ torch.linalg.lstsq(linear, motion).solution
+    assert left.square().mean() < 0.02 * motion.square().mean()
+
+
+def test_the_motion_is_held_to_what_the_views_say_until_disparities_are_maps():
+    field, codes, *_ = trying(3)
+    inside = field.span @ field.span.T
+    assert field.span.shape == (32, 3)
+    for own in (field, field.trials):
+        scramble(own)
+        assert torch.allclose(own.place(codes), own.place(codes @ inside), atol=1e-6)
+    for step in range(2, 23):
+        was = field.trials.shift.detach().clone()
+        field.at(1e-3 * step, step)
+        assert torch.allclose(field.trials.shift, was @ inside, atol=1e-6)
+    assert not field.trying
+    for progress, step, held in ((0.03, 100, True), (0.99, 1000, True), (0.99, 1001, False)):  # maps begin at 1000
+        was = scramble(field).shift.detach().clone()
+        field.at(progress, step)
+        assert torch.allclose(field.shift, was @ inside, atol=1e-6) == held
+    assert not torch.allclose(field.place(codes), field.place(codes @ inside), atol=1e-6)
+
+
+def test_where_trials_go_on_and_of_few_views_motions_stay_as_they_are():
+    field, codes, views, _ = trying(3)
+    new = make(views=9, code_dim=32)
+    new.load_state_dict(field.state_dict())
+    assert torch.equal(new.span, field.span)
+    was = new.trials.shift.detach().clone()
+    new.see(views, codes)
+    new.at(2e-3, 2)
+    assert new.trying
+    assert torch.allclose(new.trials.shift, was, atol=1e-6)
+    few = make(views=4, code_dim=32)
+    few.see(views[:4], codes[:4])
+    few.at(1e-3, 1)
+    assert few.trying
+    assert few.span is None
 
 
 def test_norm_and_radius_of_the_codes_do_not_matter():
@@ -403,6 +489,7 @@ def test_twice_the_layers_of_a_field_are_tried(layers, found):
 
 @pytest.mark.parametrize("tries", [True, False])
 def test_sets_that_begin_with_a_wrong_motion_take_one_that_was_tried(tries, monkeypatch):
+    monkeypatch.setattr(FastField, "unfold", lambda *_: None)
     if not tries:
         monkeypatch.setattr(fast, "TRIED", 0)
     wide, codes = blobs(72, 96, 0, apart=8), random_codes(5, M)

@@ -26,7 +26,7 @@ def model_and_batches(cfg: TrainConfig, device: str, views: int = 5) -> tuple[Vi
         y, x = torch.meshgrid(torch.rand(12) * 2 - 1, torch.arange(SIDE) * 2 / SIDE - 1, indexing="ij")
         batch = torch.randint(views, (12,)), torch.stack([x, y], -1), torch.rand(12, SIDE, 3)
         batches.append(PixelBatch(*(part.to(device) for part in batch)))
-    model.field.see(torch.rand(views, SIDE, SIDE, 3, device=device))
+    model.field.see(torch.rand(views, SIDE, SIDE, 3, device=device), model.codes.weight)
     return model, batches
 
 

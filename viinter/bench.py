@@ -68,7 +68,7 @@ class BareTwin(L.Callback):
         scene, cfg = trainer.datamodule.scene, self.cfg
         self.store = PixelStore(scene.views, cfg.optim.batch_pixels, cfg.optim.pixels_from, cfg.seed, module.device)
         self.twin = ViewInterpolator(cfg, scene.n, module.about).to(module.device)
-        self.twin.field.see(self.store.views)
+        self.twin.field.see(self.store.views, self.twin.codes.weight)
         self.optimizer = self.twin.configure_optimizers()
         for callback in trainer.callbacks:
             if callback is not self:

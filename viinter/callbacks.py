@@ -140,7 +140,7 @@ class Budget(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: ViewInterpolator) -> None:
         self.clock.start()
         store = trainer.datamodule.store
-        module.field.see(store.views)
+        module.field.see(store.views, module.codes.weight)
         batch = self.cfg.batch_pixels / (store.height * store.width)
         self.enough = module.field.enough(store.n / batch)
         if (seconds := self.cfg.training_seconds) is not None and not trainer.global_step:

@@ -47,7 +47,7 @@ def model_and_batch(cfg: TrainConfig) -> tuple[ViewInterpolator, PixelBatch]:
         batch = PixelBatch(
             torch.arange(VIEWS), torch.rand(VIEWS, PIXELS, 2) * 2 - 1, torch.rand(VIEWS, PIXELS, 3)
         )
-        model.field.see(torch.rand(VIEWS, SIDE, SIDE, 3))
+        model.field.see(torch.rand(VIEWS, SIDE, SIDE, 3), model.codes.weight)
     return model, batch
 
 

@@ -86,10 +86,10 @@ class ChartedField(Field):
         """A known view is drawn by as many charts as finish on it, and looking it up in others takes as long again."""
         return views * drawing() * (1 / JUDGED + 2 * bool(len(self.charts[0].remainder)))
 
-    def see(self, views: Tensor) -> None:
+    def see(self, views: Tensor, codes: Tensor) -> None:
         self.known = views
-        for chart, own in zip(self.charts, self.around(views), strict=True):
-            chart.see(own)
+        for chart, *own in zip(self.charts, self.around(views), self.around(codes), strict=True):
+            chart.see(*own)
 
     def loss(self, view: Tensor, xy: Tensor, rgb: Tensor, codes: Tensor) -> Tensor:
         """The loss of the chart whose turn it is, at the same pixels of its own views (`see`)."""

@@ -26,9 +26,10 @@ the ensembles of Hansen and Salamon 1990). They share the codes, but each has la
 motions are found, on the coarse levels, a set that falls behind takes that of the best; and before, a field of more and
 smaller textures tries motions from several beginnings, and the best of them are taken. At the end sets count with the
 shares that have the least error at the known views: a set that took repeating stripes for their neighbours loses its
-voice. A budget that is too short for all of them has fewer, and the last one fewer layers. Layered textures read
-through a homography are the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the
-cameras.
+voice. Motions begin along what known views, small and blurred, differ by most, so that neighbours begin as neighbours;
+each view by itself might be led to the wrong side of others. A budget that is too short for all of them has fewer, and
+the last one fewer layers. Layered textures read through a homography are the multi-plane images of Zhou et al. 2018 and
+Wizadwongsa et al. 2021 (NeX), which know the cameras.
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
@@ -69,6 +70,8 @@ FEW = 4  # known views at most, if mixes of their codes are held to them too, an
 GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole parts, spread evenly (Weyl 1916)
 DOUBT = 9  # pixels: within twice as many it is judged how far known views are apart
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
+ALONG = 3, 0.1  # directions at least, and the share of the first one's variance, that motions begin along; and how
+ASIDE = 0.2  # much any other counts, once disparities are maps (docs/fast_tried.md)
 LOST = 1.03  # times the least error of a set: more, and the set takes the motion of the one that has it
 RECENT = 0.1  # share of the last batch in the errors by which that is judged
 TRIED = 20  # steps of trials, if with the least of the first level they seem to fit into its share when they begin
@@ -114,6 +117,7 @@ class FastField(Field):
         self.held: Tensor | None = None  # the penalty of the last call, and what it was made of
         self.drawn: tuple[Tensor, ...] = ()
         self.known: Tensor | None = None
+        self.beginning: tuple[Tensor, Tensor] | None = None
         self.maps: tuple[Tensor, Tensor] | None = None
         self.kept: dict[str, tuple[list, Tensor]] = {}
         self.margin, self.sharpness, self.motion, self.pace = margin, sharpness, motion, pace
@@ -142,6 +146,7 @@ class FastField(Field):
         self.register_buffer("trust", torch.ones(sets))  # shares of the sets in what is drawn, once finished
         self.register_buffer("errors", torch.ones(sets))  # of late, of each set while its motion is found
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("span", None)  # [M, r]: orthonormal, what of a code the motion begins with (`unfold`)
         self.register_load_state_dict_pre_hook(FastField._loads)
         self.level = count - 1
         self.trials, self.tried, self.trying = None, 0, False
@@ -154,9 +159,36 @@ class FastField(Field):
         self.register_buffer("decision", torch.ones(()), persistent=False)
         self.register_buffer("size", torch.tensor([[width], [height]]).float(), persistent=False)
 
-    def see(self, views: Tensor) -> None:
-        """Holds the known views [n, H, W, 3] that `penalty` compares, and no copy of them, until `finish`."""
+    def see(self, views: Tensor, codes: Tensor) -> None:
+        """Holds the known views [n, H, W, 3] that `penalty` compares and `unfold` asks, and no copy of them, until
+        `finish`."""
         self.known, self.maps = views if len(views) > 1 and self.consistency else None, None
+        self.beginning = (views, codes.detach().clone()) if len(views) > FEW else None
+
+    @torch.no_grad()
+    def unfold(self, views: Tensor, codes: Tensor) -> None:
+        """Has the trials begin with motions that are linear in the `principal` coordinates of the known views
+        [n, H, W, 3] with codes [n, M], at the size of the first level; keeps the `span` of the codes that says these.
+
+        A view changes smoothly with its camera (the eigenspace of Murase and Nayar 1995), and blurred so much nearly in
+        proportion: the coordinates of a light field are its grid. From random beginnings each view finds its own way,
+        and whole rows of them may end up on the wrong side of their neighbours. So only the span moves anything until
+        disparities are maps, and what else a code has less than that from then on.
+        """
+        small = F.avg_pool2d(views.movedim(-1, 1).to(self.shift.dtype), self.reductions[0]).flatten(1)
+        places = principal(small)[:, : codes.shape[1]]
+        says = torch.linalg.pinv((codes * self.gain).double().cpu()) @ places
+        self.span = self.trials.span = torch.linalg.qr(says).Q.to(self.shift)
+        shift = self.trials.shift
+        random = shift[..., : places.shape[1]] * math.sqrt(codes.shape[1])
+        shift.copy_(random @ says.T.to(shift))
+
+    @torch.no_grad()
+    def hold(self) -> None:
+        """Takes from the motion what an optimiser put outside the `span`."""
+        if self.span is not None:
+            for own in (own for field in self._both() for own in (field.shift, field.bend)):
+                own.copy_(own @ self.span @ self.span.T)
 
     def calibrate(self, codes: Tensor) -> None:
         """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
@@ -193,6 +225,8 @@ class FastField(Field):
         mixed weights is faded in over the finest level's first part: a decision made then is often wrong too.
         """
         self.finished.fill_(False)
+        if self.training and not self.mapped():
+            self.hold()
         count = len(self.colours)
         coarse, a_step = max(0, count - 2), progress / step if step else 0.0  # that is its share of the budget
         least = LEAST[0] * coarse, LEAST[0] * coarse + LEAST[1]
@@ -222,7 +256,8 @@ class FastField(Field):
     @torch.no_grad()
     def attempt(self, step: int, affordable: bool) -> None:
         """Has the `trials` trained in place of the sets for `TRIED` steps, and then gives the sets their best motions.
-        Pixels lead from each beginning to another motion, and which is the best shows early, but not at once.
+        Pixels lead from each beginning to another motion, and which is the best shows early, but not at once. How they
+        begin: `unfold`.
 
         They begin as soon as they are `affordable`, and then go on. The first step tells nothing of the budget, and in
         seconds some more take longer than all others.
@@ -230,6 +265,8 @@ class FastField(Field):
         was, self.tried = self.trying, self.tried if step else 0
         begins = affordable and 0 < step <= WARM
         self.trying = self.trials is not None and self.tried < TRIED and (was or begins)
+        if self.trying and not was and self.beginning is not None:
+            self.unfold(*self.beginning)
         self.tried += self.trying
         if was or self.trying or not step:
             for own, value in zip(self.attempts, (self.tried, self.trying), strict=True):
@@ -266,6 +303,8 @@ class FastField(Field):
             sets = max(1, len(state[f"{prefix}shift"]))
             field._leave(sets, len(state[f"{prefix}disparity"]) // sets)
             state.setdefault(f"{prefix}errors", field.errors)
+            if f"{prefix}span" in state:
+                field.span = torch.zeros_like(state[f"{prefix}span"], device=field.shift.device)
             if f"{prefix}trials.shift" not in state:
                 field.trials = None
             field.tried, trying = state.setdefault(f"{prefix}attempts", field.attempts).tolist()
@@ -330,7 +369,11 @@ class FastField(Field):
         whole, difference, other = self.shift.split(2, 1)
         across = torch.stack([-whole[:, 1], whole[:, 0]], 1)
         matrix = torch.cat([whole, whole + difference, self.bend, across + other], 1)
-        return F.linear(z * self.gain, matrix.flatten(0, 1)).unflatten(1, matrix.shape[:2])
+        z = z * self.gain
+        if self.span is not None:
+            inside = z @ self.span @ self.span.T
+            z = torch.lerp(inside, z, ASIDE if self.mapped() else 0.0)
+        return F.linear(z, matrix.flatten(0, 1)).unflatten(1, matrix.shape[:2])
 
     def basis(self, xy: Tensor) -> Tensor:
         """The polynomials phi [V, K, P] at the pixels `xy` [V, 2, P]: planes, with which products are ten times as
@@ -559,7 +602,8 @@ class FastField(Field):
             if self.doubts:
                 self.remainder[:, 3:] = around(self.remainder[:, 3:].to(views), DOUBT).sqrt()
         self.finished.fill_(True)
-        self.known = self.maps = None  # nothing is compared any more, and whoever keeps the field need not keep them
+        # nothing is compared any more, and whoever keeps the field need not keep them
+        self.known = self.maps = self.beginning = None
         self.train(was)
 
     def apart(self, number: int, maps: Tensor, xy: Tensor, phi: Tensor, place: Tensor, seen: Tensor) -> Tensor:
@@ -627,6 +671,17 @@ def reductions(height: int, width: int, texture_pixels: int, coarsest: int = STE
 def tried(layers: int) -> tuple[int, int]:
     """Layers of a set, and sets, that are tried for a field of so many `layers` in all."""
     return USUAL[0], max(SPARE, SPARE * layers // USUAL[0])
+
+
+def principal(points: Tensor) -> Tensor:
+    """Coordinates [n, r] of `points` [n, D] along their principal directions (Pearson 1901), `ALONG` of n - 1 at most,
+    with a mean square of 1 a point; in double precision, on the CPU."""
+    least, share = ALONG
+    points = points.double().cpu()
+    u, sizes, _ = torch.linalg.svd(points - points.mean(0), full_matrices=False)
+    count = max(least, int((sizes.square() >= share * sizes[0].square()).sum()))
+    places = (u * sizes)[:, : min(count, len(points) - 1)]
+    return places / places.square().sum(1).mean().sqrt().clamp_min(1e-12)
 
 
 def best_shares(covariance: Tensor) -> Tensor:

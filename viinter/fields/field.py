@@ -51,8 +51,9 @@ class Field(nn.Module):
         """
         return 0.0
 
-    def see(self, views: Tensor) -> None:
-        """Called before the first step, and where training goes on, with the known views [n, H, W, 3]."""
+    def see(self, views: Tensor, codes: Tensor) -> None:
+        """Called before the first step, and where training goes on, with the known views [n, H, W, 3] and their codes
+        [n, M]."""
 
     def finish(self, views: Tensor, codes: Tensor) -> None:
         """Called once, after the last step, with the known views [n, H, W, 3] and their codes [n, M]."""
