@@ -26,10 +26,10 @@ the ensembles of Hansen and Salamon 1990). They share the codes, but each has la
 motions are found, on the coarse levels, a set that falls behind takes that of the best; and before, a field of more and
 smaller textures tries motions from several beginnings, and the best of them are taken. At the end sets count with the
 shares that have the least error at the known views: a set that took repeating stripes for their neighbours loses its
-voice. Motions begin along what known views, small and blurred, differ by most, so that neighbours begin as neighbours;
-each view by itself might be led to the wrong side of others. A budget that is too short for all of them has fewer, and
-the last one fewer layers. Layered textures read through a homography are the multi-plane images of Zhou et al. 2018 and
-Wizadwongsa et al. 2021 (NeX), which know the cameras.
+voice. What is tried begins along what known views, small and blurred, differ by most, so that neighbours begin as
+neighbours; each view by itself might be led to the wrong side of others. A budget that is too short for all of them has
+fewer, and the last one fewer layers. Layered textures read through a homography are the multi-plane images of Zhou et
+al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
@@ -66,12 +66,12 @@ EDGE = 20.0  # for each unit of rgb: how fast a step of colour lets the disparit
 NEAREST = 8  # known views that share in a remainder
 COMPARED = 4  # one of so many pieces of a batch is looked up in another known view
 PARTNERS = 4  # which is one of so many nearest in motion, in turns
-FEW = 4  # known views at most, if mixes of their codes are held to them too, and if sets are not `DEEP`
+FEW = 4  # known views at most, if mixes of their codes are held to them too, motions begin at random, sets not `DEEP`
 GOLDEN = 40_503  # of 65,536, the golden section: its multiples, less whole parts, spread evenly (Weyl 1916)
 DOUBT = 9  # pixels: within twice as many it is judged how far known views are apart
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
-ALONG = 3, 0.1  # directions at least, and the share of the first one's variance, that motions begin along; and how
-ASIDE = 0.2  # much any other counts, once disparities are maps (docs/fast_tried.md)
+ALONG = 3, 0.1  # motions begin along so many directions at least, and all with this share of the first one's variance
+ASIDE = 0.2  # times as much as these any other counts once disparities are maps; found by trial (docs/fast_tried.md)
 LOST = 1.03  # times the least error of a set: more, and the set takes the motion of the one that has it
 RECENT = 0.1  # share of the last batch in the errors by which that is judged
 TRIED = 20  # steps of trials, if with the least of the first level they seem to fit into its share when they begin
@@ -187,8 +187,13 @@ class FastField(Field):
     def hold(self) -> None:
         """Takes from the motion what an optimiser put outside the `span`."""
         if self.span is not None:
-            for own in (own for field in self._both() for own in (field.shift, field.bend)):
-                own.copy_(own @ self.span @ self.span.T)
+            for field in self._both():
+                for own in (field.shift, field.bend):
+                    own.copy_(self._inside(own))
+
+    def _inside(self, codes: Tensor) -> Tensor:
+        """What of `codes` [..., M] lies in the `span`."""
+        return codes @ self.span @ self.span.T
 
     def calibrate(self, codes: Tensor) -> None:
         """Takes the codes' Euclidean scale out, once, so that norm and radius of the codes [n, M] do not matter."""
@@ -371,8 +376,7 @@ class FastField(Field):
         matrix = torch.cat([whole, whole + difference, self.bend, across + other], 1)
         z = z * self.gain
         if self.span is not None:
-            inside = z @ self.span @ self.span.T
-            z = torch.lerp(inside, z, ASIDE if self.mapped() else 0.0)
+            z = torch.lerp(self._inside(z), z, ASIDE if self.mapped() else 0.0)
         return F.linear(z, matrix.flatten(0, 1)).unflatten(1, matrix.shape[:2])
 
     def basis(self, xy: Tensor) -> Tensor:
