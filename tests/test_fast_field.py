@@ -30,7 +30,7 @@ def one_set(field: FastField, k: int) -> FastField:
     """Set number k of `field` as a field of its own."""
     sets, layers = field.sets, field.layers
     one = make(sets=1, layers=layers, entropy=field.entropy)
-    one.level, of_a_set = field.level, ("colours", "weights", "delta", "disparity", "shift", "bend")
+    one.level, of_a_set = field.level, ("colours", "weights", "delta", "disparity", "shift", "bend", "phase")
     for key, value in one.state_dict().items():
         if key.startswith(of_a_set):
             value.copy_(field.state_dict()[key].unflatten(0, (sets, -1))[k])
@@ -368,6 +368,31 @@ def test_the_penalty_is_greatest_undecided_and_nothing_once_each_pixel_has_one_l
         field.weights[-1][[1, 6]] = 10.0  # one of each set
     field(xy, z)
     assert penalty(field).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_textures_of_sets_lie_half_a_pixel_apart():
+    """Four sets that have the same layers and do not move show the same, each at its own place."""
+    field, z = scramble(make(48, 64, sets=4)), torch.randn(1, M)
+    with torch.no_grad():
+        for own in (field.shift, field.bend):
+            own.zero_()
+        for maps in (*field.colours, *field.weights, field.delta, field.disparity):
+            each = maps.unflatten(0, (4, -1))
+            each.copy_(each[:1].clone().expand_as(each))
+    xy = 1.6 * torch.rand(1, 2, 50) - 0.8
+    pixel = field.margin * 2 / torch.tensor(field.colours[-1].shape[:1:-1])
+    shown = field.each_set(xy, field.basis(xy), field.place(z))[0]
+    for own, apart in zip(shown, [(0.0, 0.0), (0.5, 0.5), (0.5, 0.0), (0.0, 0.5)], strict=True):
+        there = xy + (torch.tensor(apart) * pixel)[:, None]
+        assert torch.allclose(own, field.each_set(there, field.basis(there), field.place(z))[0][0], atol=1e-5)
+    assert not torch.allclose(shown[0], shown[1], atol=1e-3)
+
+
+def test_checkpoints_from_before_sets_lay_apart_draw_what_they_drew():
+    field, other, z = scramble(make()), make(), torch.randn(M)
+    field.phase.zero_()
+    other.load_state_dict({key: value for key, value in field.state_dict().items() if "phase" not in key})
+    assert torch.equal(draw(other.eval(), z, 32, 32), draw(field.eval(), z, 32, 32))
 
 
 def test_error_and_penalty_together_are_the_mean_error_of_the_sets():

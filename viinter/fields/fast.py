@@ -26,10 +26,11 @@ the ensembles of Hansen and Salamon 1990). They share the codes, but each has la
 motions are found, on the coarse levels, a set that falls behind takes that of the best; and before, a field of more and
 smaller textures tries motions from several beginnings, and the best of them are taken. At the end sets count with the
 shares that have the least error at the known views: a set that took repeating stripes for their neighbours loses its
-voice. What is tried begins along what known views, small and blurred, differ by most, so that neighbours begin as
-neighbours; each view by itself might be led to the wrong side of others. A budget that is too short for all of them has
-fewer, and the last one fewer layers. Layered textures read through a homography are the multi-plane images of Zhou et
-al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
+voice. Their textures lie half a pixel apart, or what reading between pixels gets wrong would be wrong in all alike:
+where motions begin right, they begin alike. What is tried begins along what known views, small and blurred, differ by
+most, so that neighbours begin as neighbours; each view by itself might be led to the wrong side of others. A budget
+that is too short for all of them has fewer, and the last one fewer layers. Layered textures read through a homography
+are the multi-plane images of Zhou et al. 2018 and Wizadwongsa et al. 2021 (NeX), which know the cameras.
 
 Textures can learn the known views by heart under a wrong motion, above all if there are few views. The motion is
 therefore also held to the known views themselves: what a view shows at a pixel should be found where the motion
@@ -72,6 +73,7 @@ DOUBT = 9  # pixels: within twice as many it is judged how far known views are a
 JUDGED = 8  # one of so many rows of the known views says how much each set counts
 ALONG = 3, 0.1  # motions begin along so many directions at least, and all with this share of the first one's variance
 ASIDE = 0.2  # times as much as these any other counts once disparities are maps; found by trial (docs/fast_tried.md)
+PHASES = (0, 0), (0.5, 0.5), (0.5, 0), (0, 0.5)  # pixels, of sets in turns: how their textures lie against each other
 LOST = 1.03  # times the least error of a set: more, and the set takes the motion of the one that has it
 RECENT = 0.1  # share of the last batch in the errors by which that is judged
 TRIED = 20  # steps of trials, if with the least of the first level they seem to fit into its share when they begin
@@ -144,6 +146,8 @@ class FastField(Field):
         self.register_buffer("remainder", torch.zeros(shape, dtype=torch.float16))
         self.register_buffer("places", torch.zeros(shape[0], sets, 4 * motion + 2))
         self.register_buffer("trust", torch.ones(sets))  # shares of the sets in what is drawn, once finished
+        phases = torch.tensor([PHASES[number % len(PHASES)] for number in range(sets)])
+        self.register_buffer("phase", phases * 2 / torch.tensor(sizes[-1]).flip(0))  # [S, 2]
         self.register_buffer("errors", torch.ones(sets))  # of late, of each set while its motion is found
         self.register_buffer("finished", torch.zeros((), dtype=torch.bool))
         self.register_buffer("span", None)  # [M, r]: orthonormal, what of a code the motion begins with (`unfold`)
@@ -308,6 +312,7 @@ class FastField(Field):
             sets = max(1, len(state[f"{prefix}shift"]))
             field._leave(sets, len(state[f"{prefix}disparity"]) // sets)
             state.setdefault(f"{prefix}errors", field.errors)
+            state.setdefault(f"{prefix}phase", torch.zeros_like(field.phase))  # once they lay alike
             if f"{prefix}span" in state:
                 field.span = torch.zeros_like(state[f"{prefix}span"], device=field.shift.device)
             if f"{prefix}trials.shift" not in state:
@@ -322,7 +327,7 @@ class FastField(Field):
             return
         for maps in (*self.colours, *self.weights, self.delta, self.disparity):
             maps.data = maps.data.unflatten(0, (self.sets, self.layers))[:sets, :layers].flatten(0, 1).clone()
-        for own in (self.shift, self.bend, self.trust, self.errors):
+        for own in (self.shift, self.bend, self.trust, self.phase, self.errors):
             own.data = own.data[:sets].clone()
         self.places = self.places[:, :sets].clone()
         self.sets, self.layers = sets, layers
@@ -435,7 +440,8 @@ class FastField(Field):
         weights [S, L, V, P], and its disparity and drift [S, 2, V, P]."""
         a, b, c = (part[:, None] for part in self.carry(phi, place))  # [S, 1, V, 2, P]
         disparity = self.disparity.view(self.sets, self.layers, 1, 1)
-        u = torch.addcmul(xy / self.margin + a, disparity[..., None], b)  # [S, L, V, 2, P]
+        u = xy / self.margin + self.phase.view(-1, 1, 1, 2, 1) + a
+        u = torch.addcmul(u, disparity[..., None], b)  # [S, L, V, 2, P]
         drift = None
         if self.mapped():
             delta, drift = read(self.delta, u).unbind(2)
