@@ -26,7 +26,7 @@ the ensembles of Hansen and Salamon 1990). They share the codes, but each has la
 motions are found, on the coarse levels, a set that falls behind takes that of the best; and before, a field of more and
 smaller textures tries motions from several beginnings, and the best of them are taken. At the end sets count with the
 shares that have the least error at the known views: a set that took repeating stripes for their neighbours loses its
-voice. Their textures lie half a pixel apart, or what reading between pixels gets wrong would be wrong in all alike:
+voice. The sets' textures lie half a pixel apart, or what reading between pixels gets wrong would be wrong in all alike:
 where motions begin right, they begin alike. What is tried begins along what known views, small and blurred, differ by
 most, so that neighbours begin as neighbours; each view by itself might be led to the wrong side of others. A budget
 that is too short for all of them has fewer, and the last one fewer layers. Layered textures read through a homography
