@@ -59,7 +59,7 @@ MOST = 100, 300  # steps at each of the coarse levels, and at half size
 LEAST = 10, 15  # the same in short budgets, unless they take more than these shares of it until they are finished:
 LATEST = 0.40, 0.65
 ENOUGH = 1500, 60  # steps, and passes over the known pixels: after both more time only learns known views by heart
-FEWEST = 300  # steps for which a budget in seconds should be enough, or sets are left out
+FEWEST = 30  # steps for each layer of all sets: a budget in seconds should be enough for so many, or has fewer sets
 USUAL = 4, 4  # layers of a set, and sets
 DEEP = 8, 2  # the same for photographs by hand, which take as long; found by trial (docs/fast_tried.md)
 STEP = 4.5  # drawings of its pixels that a training step takes as long as
@@ -565,10 +565,11 @@ class FastField(Field):
 
     def settle(self, seconds: float, views: int, batch: float, drawing: Callable[[], float]) -> float:
         """Halves the sets, and then the last one's layers down to the usual, until the budget is enough for `FEWEST`
-        steps: in too few of them many sets learn less than one that has all the time to itself. Where processes train
-        together all stay: they have agreed on the parameters' sizes."""
+        steps for each layer: in too few of them many sets learn less than one that has all the time to itself. Where
+        processes train together all stay: they have agreed on the parameters' sizes."""
         took, alone = drawing(), not torch.distributed.is_initialized()
-        while alone and (self.sets > 1 or self.layers > USUAL[0]) and seconds < FEWEST * STEP * batch * took:
+        enough = seconds / (FEWEST * STEP * batch)
+        while alone and (self.sets > 1 or self.layers > USUAL[0]) and enough < self.sets * self.layers * took:
             if self.sets > 1:
                 self._leave((self.sets + 1) // 2, self.layers)
             else:
